@@ -1,0 +1,145 @@
+"""The few nouns that travel through the package: a cloud, a prepared cloud, correspondences, a hypothesis.
+
+All of them are frozen; arrays inside are float64 unless said otherwise and are to be treated as read-only.
+Frames: a *file* coordinate is what the user's data holds; a *local* coordinate is the file coordinate minus
+the cloud's float64 ``origin``. Everything between loading and the result works in local coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Finite points of one scan, recentred.
+
+    Attributes:
+        points: (N, 3) local coordinates; file coordinate = points + origin.
+        origin: (3,) float64 shift removed at load, whole units, zero for clouds close to zero.
+        normals: (N, 3) unit normals or None.
+        colors: (N, 3) in [0, 1] or None.
+        name: what to call the cloud in messages.
+        num_non_finite: rows dropped because a coordinate was NaN or infinite.
+    """
+
+    points: FloatArray
+    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
+    normals: FloatArray | None = None
+    colors: FloatArray | None = None
+    name: str = "cloud"
+    num_non_finite: int = 0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def file_points(self) -> FloatArray:
+        """(N, 3) points in the coordinates of the user's data."""
+        return self.points + self.origin
+
+
+@dataclass(frozen=True)
+class PreparedCloud:
+    """A cloud on a voxel grid with oriented normals and, once described, FPFH features.
+
+    Attributes:
+        points: (n, 3) one representative per occupied voxel, local coordinates.
+        normals: (n, 3) unit normals turned towards ``viewpoint``.
+        features: (n, 33) float32 L2-normalised FPFH, or None before description.
+        voxel_size: edge of the grid in cloud units.
+        viewpoint: (3,) local position of the sensor, or None where it is not known.
+        origin: (3,) float64 shift as in `PointCloud`.
+        name: what to call the cloud in messages.
+        num_input: points given, before anything was dropped.
+        num_non_finite: points dropped for a NaN or infinite coordinate.
+        num_duplicates: points dropped because another has exactly the same coordinates.
+        num_isolated: voxels dropped because no neighbour lies close enough to fit a normal.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    features: Float32Array | None
+    voxel_size: float
+    viewpoint: FloatArray | None
+    origin: FloatArray
+    name: str = "cloud"
+    num_input: int = 0
+    num_non_finite: int = 0
+    num_duplicates: int = 0
+    num_isolated: int = 0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Putative correspondences between two prepared clouds, or anybody's own.
+
+    Attributes:
+        points: (N, 6) rows [source xyz, target xyz], each half in its own cloud's local coordinates.
+        source_index: (N,) rows of the source cloud, or None for foreign correspondences.
+        target_index: (N,) rows of the target cloud, or None.
+        feature_distance: (N,) float32 Euclidean distance of the unit features in [0, 2], or None.
+        ratio: (N,) float32 feature distance over that of the second best target, in [0, 1], or None.
+        mutual: (N,) True where the source point is also the target's nearest in feature space, or None.
+    """
+
+    points: FloatArray
+    source_index: IntArray | None = None
+    target_index: IntArray | None = None
+    feature_distance: Float32Array | None = None
+    ratio: Float32Array | None = None
+    mutual: BoolArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def source(self) -> FloatArray:
+        """(N, 3) source points."""
+        return self.points[:, :3]
+
+    @property
+    def target(self) -> FloatArray:
+        """(N, 3) target points."""
+        return self.points[:, 3:]
+
+    def take(self, rows: IntArray | BoolArray) -> Correspondences:
+        """The correspondences of the given rows (index or mask), all per-row attributes kept."""
+
+        def pick(values: NDArray[np.generic] | None) -> NDArray[np.generic] | None:
+            return None if values is None else values[rows]
+
+        return Correspondences(
+            self.points[rows],
+            pick(self.source_index),  # type: ignore[arg-type]
+            pick(self.target_index),  # type: ignore[arg-type]
+            pick(self.feature_distance),  # type: ignore[arg-type]
+            pick(self.ratio),  # type: ignore[arg-type]
+            pick(self.mutual),  # type: ignore[arg-type]
+        )
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One candidate rigid motion with what the correspondences say for it.
+
+    Attributes:
+        T_target_source: (4, 4), p_target = R p_source + t in local coordinates.
+        score: larger is better; comparable only between hypotheses of one estimator call.
+        num_inliers: correspondences with a residual under the inlier threshold.
+    """
+
+    T_target_source: FloatArray
+    score: float
+    num_inliers: int

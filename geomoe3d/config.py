@@ -1,0 +1,212 @@
+"""Typed, frozen configuration; an unknown key is an error that names the nearest known one.
+
+Lengths are given in multiples of the voxel size, so that one configuration serves 5 cm rooms and 30 cm
+lidar; only ``voxel_size`` itself and ``viewpoint`` are in cloud units. YAML files hold the same tree
+(see configs/).
+"""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from geomoe3d.errors import ConfigError
+
+S = TypeVar("S", bound="Section")
+
+
+class Section(BaseModel):
+    """A node of the configuration tree: frozen, strict about keys, lenient about 1 against 1.0."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class PreparationConfig(Section):
+    """From a raw cloud to voxel points with oriented normals."""
+
+    voxel_points: int = Field(5000, ge=200, description="points per cloud that an automatic voxel aims at")
+    max_points: int = Field(
+        30_000, ge=100, description="voxel points kept per cloud; beyond it a seeded choice is taken"
+    )
+    normal_radius: float = Field(2.0, gt=0, description="neighbourhood of a normal, in voxels")
+    normal_neighbors: int = Field(30, ge=3)
+    feature_radius: float = Field(5.0, gt=0, description="neighbourhood of FPFH, in voxels")
+    feature_neighbors: int = Field(100, ge=3)
+    viewpoint: Literal["auto", "origin", "centroid"] = Field(
+        "auto",
+        description="where the sensor stood: the file's origin, unknown (normals turn to the centroid), or "
+        "auto: the origin when it lies within one extent of the cloud, else unknown",
+    )
+
+
+class MatchingConfig(Section):
+    """Nearest neighbours in feature space."""
+
+    method: Literal["one_way", "mutual", "ratio"] = "one_way"
+    neighbors: int = Field(1, ge=1, le=10, description="targets kept per source point")
+    max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by method ratio")
+    max_correspondences: int = Field(
+        5000, ge=3, description="at most so many correspondences are used, those with the best ratio"
+    )
+
+
+class FilterConfig(Section):
+    """What weighs the correspondences before estimation."""
+
+    name: str = Field("none", description="none | spectral, or a filter registered later")
+
+
+class EstimatorConfig(Section):
+    """From weighted correspondences to candidate motions."""
+
+    name: Literal["consensus", "ransac", "svd"] = "consensus"
+    inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
+    num_hypotheses: int = Field(8, ge=1, description="distinct hypotheses kept")
+    ransac_iterations: int = Field(50_000, ge=1)
+    ransac_confidence: float = Field(0.999, gt=0, lt=1)
+
+
+class VerificationConfig(Section):
+    """Re-scoring of the hypotheses against the clouds themselves."""
+
+    enabled: bool = True
+
+
+class RefinementConfig(Section):
+    """Local refinement of the chosen hypothesis on the clouds."""
+
+    method: Literal["none", "icp", "gicp"] = "icp"
+    max_distance: float = Field(1.0, gt=0, description="largest distance of matched points, in voxels")
+    max_iterations: int = Field(30, ge=1)
+
+
+class JudgementConfig(Section):
+    """When an answer may be called ok."""
+
+    min_confidence: float = Field(0.5, ge=0, le=1, description="below it the status is low_confidence")
+    ambiguity_ratio: float = Field(
+        0.9, gt=0, le=1, description="a distinct second hypothesis this good makes the answer ambiguous"
+    )
+
+
+class RegistrationConfig(Section):
+    """Everything that decides a registration besides the two clouds."""
+
+    voxel_size: float | None = Field(None, gt=0, description="cloud units; None chooses and reports one")
+    seed: int = Field(0, ge=0)
+    preparation: PreparationConfig = PreparationConfig()
+    matching: MatchingConfig = MatchingConfig()
+    filter: FilterConfig = FilterConfig()
+    estimator: EstimatorConfig = EstimatorConfig()
+    verification: VerificationConfig = VerificationConfig()
+    refinement: RefinementConfig = RefinementConfig()
+    judgement: JudgementConfig = JudgementConfig()
+
+
+def known_keys(section: type[Section], prefix: str = "") -> list[str]:
+    """Dotted names of every leaf of a configuration tree, in declaration order."""
+    keys: list[str] = []
+    for name, info in section.model_fields.items():
+        kind = info.annotation
+        if isinstance(kind, type) and issubclass(kind, Section):
+            keys += known_keys(kind, f"{prefix}{name}.")
+        else:
+            keys.append(prefix + name)
+    return keys
+
+
+def build_config(section: type[S], tree: dict[str, Any] | None, where: str = "configuration") -> S:
+    """Validate a nested mapping into a configuration.
+
+    Args:
+        section: the class of the root.
+        tree: nested mapping as YAML gives it; None or empty means all defaults.
+        where: what to call the source in messages.
+
+    Raises:
+        ConfigError: an unknown key (names the nearest known one) or a value out of its range.
+    """
+    if tree is not None and not isinstance(tree, dict):
+        raise ConfigError(f"{where}: expected a mapping of keys to values, found {type(tree).__name__}")
+    try:
+        return section.model_validate(tree or {})
+    except ValidationError as error:
+        raise ConfigError(f"{where}: {_explain(error, section)}") from None
+
+
+def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
+    """Apply ``a.b=value`` strings (value parsed as YAML) to a copy of a nested mapping.
+
+    Raises:
+        ConfigError: an assignment without ``=`` or through a key that is no section.
+    """
+    import copy
+
+    import yaml
+
+    result = copy.deepcopy(tree)
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"'{assignment}' is no assignment; write key=value, e.g. estimator.name=ransac")
+        node = result
+        *parents, leaf = key.strip().split(".")
+        for parent in parents:
+            child = node.setdefault(parent, {})
+            if not isinstance(child, dict):
+                raise ConfigError(f"'{assignment}': '{parent}' holds a value, not a section")
+            node = child
+        try:
+            node[leaf] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"'{assignment}': the value is not valid YAML ({error})") from None
+    return result
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Read one YAML mapping.
+
+    Raises:
+        ConfigError: the file is missing, unreadable, no YAML, or holds no mapping.
+    """
+    import yaml
+
+    try:
+        tree = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"'{path}' is not valid YAML: {error}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"'{path}' holds a {type(tree).__name__}, expected a mapping of keys to values")
+    return tree
+
+
+def load_config(path: str | Path | None = None, assignments: list[str] | None = None) -> RegistrationConfig:
+    """The registration configuration of a YAML file (None: defaults) with ``key=value`` overrides."""
+    tree = read_yaml(path) if path is not None else {}
+    return build_config(RegistrationConfig, set_keys(tree, assignments or []), str(path or "configuration"))
+
+
+def _explain(error: ValidationError, section: type[Section]) -> str:
+    parts = []
+    for problem in error.errors():
+        key = ".".join(str(part) for part in problem["loc"])
+        if problem["type"] == "extra_forbidden":
+            parts.append(f"unknown key '{key}'; {_nearest(key, known_keys(section))}")
+        else:
+            parts.append(f"'{key}' = {problem['input']!r}: {problem['msg']}")
+    return "; ".join(parts)
+
+
+def _nearest(key: str, keys: list[str]) -> str:
+    close = difflib.get_close_matches(key, keys, n=1, cutoff=0.4)
+    if not close:  # the leaf alone often matches where the section was forgotten
+        leaves = {name.rsplit(".", 1)[-1]: name for name in keys}
+        close = [leaves[m] for m in difflib.get_close_matches(key.rsplit(".", 1)[-1], list(leaves), n=1)]
+    return f"did you mean '{close[0]}'?" if close else "known keys: " + ", ".join(keys)

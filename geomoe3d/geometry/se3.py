@@ -1,0 +1,60 @@
+"""Rigid motions as 4x4 matrices: T_b_a maps p_a to p_b = R p_a + t."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomoe3d.types import FloatArray
+
+
+def make_transform(R: FloatArray, t: FloatArray) -> FloatArray:
+    """(..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
+    """R p + t for points (N, 3) and one transform (4, 4); float64."""
+    moved: FloatArray = points @ T[:3, :3].T + T[:3, 3]
+    return moved
+
+
+def inverse(T: FloatArray) -> FloatArray:
+    """Inverse of a rigid motion (4, 4), using R^-1 = R^T."""
+    R = T[:3, :3]
+    return make_transform(R.T, -R.T @ T[:3, 3])
+
+
+def rotation_angle_deg(R: FloatArray) -> float:
+    """Angle of a rotation (3, 3) in degrees, in [0, 180]; accurate near 0 as well as near 180."""
+    cosine = (np.trace(R) - 1.0) / 2.0
+    sine = np.linalg.norm(R - R.T) / np.sqrt(8.0)
+    return float(np.degrees(np.arctan2(sine, cosine)))
+
+
+def rotation_error_deg(T_estimate: FloatArray, T_truth: FloatArray) -> float:
+    """Angle between the rotations of two motions in degrees (PointDSC's RE, without its clamp)."""
+    return rotation_angle_deg(T_estimate[:3, :3].T @ T_truth[:3, :3])
+
+
+def translation_error(T_estimate: FloatArray, T_truth: FloatArray) -> float:
+    """|t_estimate - t_truth| in cloud units (PointDSC's TE)."""
+    return float(np.linalg.norm(T_estimate[:3, 3] - T_truth[:3, 3]))
+
+
+def project_to_so3(R: FloatArray) -> FloatArray:
+    """The rotation nearest to a 3x3 matrix in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(R)
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    rotation: FloatArray = U @ D @ Vt
+    return rotation
+
+
+def shift_frames(T_local: FloatArray, source_origin: FloatArray, target_origin: FloatArray) -> FloatArray:
+    """A motion between local frames, expressed between the file frames (file = local + origin)."""
+    T = T_local.copy()
+    T[:3, 3] = T_local[:3, 3] + target_origin - T_local[:3, :3] @ source_origin
+    return T

@@ -1,0 +1,93 @@
+"""geomoe3d: two scans in, the rigid transform out, with an honest word on how sure it is.
+
+    import geomoe3d
+    result = geomoe3d.register("source.ply", "target.ply")
+    print(result.status, result.confidence)
+    moved = result.apply(source_points)      # p_target = R p_source + t
+
+Every public name is loaded when it is first used (PEP 562), so that importing the package is quick, quiet
+and pulls in none of the heavy libraries below it.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from geomoe3d.clouds.io import load_points, save_points
+    from geomoe3d.config import RegistrationConfig, load_config
+    from geomoe3d.errors import (
+        CheckpointError,
+        ConfigError,
+        DependencyError,
+        EmptyCloudError,
+        FormatError,
+        GeoMoE3DError,
+        InputError,
+        NonFiniteError,
+        OutputError,
+    )
+    from geomoe3d.registration import Registrar, register
+    from geomoe3d.result import RegistrationResult
+    from geomoe3d.types import Correspondences, PointCloud
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "Correspondences",
+    "DependencyError",
+    "EmptyCloudError",
+    "FormatError",
+    "GeoMoE3DError",
+    "InputError",
+    "NonFiniteError",
+    "OutputError",
+    "PointCloud",
+    "Registrar",
+    "RegistrationConfig",
+    "RegistrationResult",
+    "__version__",
+    "load_config",
+    "load_points",
+    "register",
+    "save_points",
+]
+
+_HOME = {
+    "Registrar": "registration",
+    "register": "registration",
+    "RegistrationResult": "result",
+    "RegistrationConfig": "config",
+    "load_config": "config",
+    "load_points": "clouds.io",
+    "save_points": "clouds.io",
+    "Correspondences": "types",
+    "PointCloud": "types",
+}
+
+
+if not TYPE_CHECKING:  # a type checker that saw it would accept every misspelt name
+
+    def __getattr__(name):
+        if name not in __all__:
+            raise AttributeError(_unknown(name))
+        value = getattr(import_module(f"{__name__}.{_HOME.get(name, 'errors')}"), name)
+        globals()[name] = value  # the next look-up does not come here
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _unknown(name: str) -> str:
+    message = f"module 'geomoe3d' has no attribute '{name}'"
+    if name.startswith("__"):  # probes of the interpreter and of tools; nobody reads the answer
+        return message
+    from difflib import get_close_matches
+
+    close = get_close_matches(name, __all__, n=1)
+    return message + (f"; did you mean '{close[0]}'?" if close else f"; public names: {', '.join(__all__)}")

@@ -1,0 +1,36 @@
+"""``geomoe3d config``: the complete configuration, with what each key means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from geomoe3d.cli.errors import HELP, traceback_option
+
+
+@click.command(context_settings=HELP)
+@click.option("--config", "source", metavar="FILE", help="Start from this YAML file.")
+@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="Change one value.")
+@click.option("--out", metavar="FILE", help="Write to this file instead of the screen.")
+@click.option("--force", is_flag=True, help="Replace a file that exists.")
+@traceback_option
+def command(source: str | None, assignments: tuple[str, ...], out: str | None, force: bool) -> None:
+    """Print the complete configuration of `register` as commented YAML.
+
+    Edit it and pass it on with `register --config FILE`; keys left out keep their defaults.
+    """
+    from geomoe3d.config import load_config
+    from geomoe3d.config_text import commented_yaml
+    from geomoe3d.files import write_atomically
+
+    text = commented_yaml(load_config(source, list(assignments)))
+    if out is None:
+        click.echo(text, nl=False)
+        return
+
+    def write(path: Path) -> None:
+        path.write_text(text, encoding="utf-8")
+
+    write_atomically(out, write, force=force)
+    click.echo(out)

@@ -1,0 +1,30 @@
+"""``geomoe3d doctor``: what is missing on this machine."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
+
+_COLORS = {"ok": "green", "missing": "yellow", "broken": "red"}
+
+
+@click.command(context_settings=HELP)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@traceback_option
+@click.pass_context
+def command(context: click.Context, as_json: bool) -> None:
+    """Say what this machine lacks, and the command that mends it.
+
+    Exit code 0 when everything required is there, else 2.
+    """
+    from geomoe3d import doctor
+
+    findings = doctor.examine()
+    if as_json:
+        click.echo(json.dumps(doctor.as_json(findings), indent=2))
+    else:
+        click.echo(doctor.report(findings, lambda text, state: click.style(text, fg=_COLORS[state])))
+    context.exit(0 if doctor.is_healthy(findings) else BAD_INPUT)

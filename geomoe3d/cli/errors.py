@@ -1,0 +1,98 @@
+"""From exceptions to messages and exit codes; the one place where a command ends.
+
+0 done and sure; 1 a fault of the program; 2 the input, an option or the machine is at fault; 3 done, but
+not sure of the answer; 130 interrupted; 141 the reader of stdout went away (as a signal SIGPIPE gives).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import click
+
+from geomoe3d.errors import GeoMoE3DError
+
+OK, FAULT, BAD_INPUT, NOT_SURE, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 3, 130, 141
+
+HELP = {"help_option_names": ["-h", "--help"]}
+"""Click's settings of every command."""
+
+_TRACEBACK = "geomoe3d.traceback"
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def run(command: click.Command, name: str, arguments: Sequence[str] | None = None) -> int:
+    """Run a command to its exit code; never raises, never shows a traceback that nobody asked for.
+
+    Args:
+        command: a verb or the group of verbs.
+        name: what the user typed, for the usage line.
+        arguments: None takes those of the process.
+    """
+    completing = os.environ.get(f"_{name.upper()}_COMPLETE")
+    if completing:
+        from click.shell_completion import shell_complete
+
+        return shell_complete(command, {}, name, f"_{name.upper()}_COMPLETE", completing)
+    wanted = {_TRACEBACK: os.environ.get("GEOMOE3D_TRACEBACK", "") not in ("", "0")}
+    try:
+        try:
+            context = command.make_context(name, list(sys.argv[1:] if arguments is None else arguments))
+            context.meta.update({**wanted, **context.meta})
+            wanted = context.meta  # shared with the contexts of the verbs
+            with context:
+                command.invoke(context)
+            code = OK
+        except click.exceptions.Exit as stop:
+            code = stop.exit_code
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # What Python still holds for stdout must go nowhere, or it complains on its way out.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return PIPE_CLOSED
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("interrupted", err=True)
+        return INTERRUPTED
+    except click.ClickException as error:
+        error.show()
+        return BAD_INPUT
+    except Exception as error:
+        if wanted[_TRACEBACK]:
+            traceback.print_exc()
+        return _explain(error, bool(wanted[_TRACEBACK]))
+
+
+def _explain(error: Exception, shown: bool) -> int:
+    if isinstance(error, GeoMoE3DError):
+        click.echo(f"error: {error}", err=True)
+        return BAD_INPUT
+    if isinstance(error, MemoryError):
+        message = "out of memory; a larger --voxel-size needs less"
+    else:
+        text = " ".join(str(error).split())
+        message = f"internal error: {type(error).__name__}{': ' if text else ''}{text}"
+    hint = "" if shown else "; --traceback (or GEOMOE3D_TRACEBACK=1) shows where"
+    click.echo(f"{message}\nThis is a fault of geomoe3d, not of your input{hint}.", err=True)
+    return FAULT
+
+
+def traceback_option(function: F) -> F:
+    """Gives a verb the option ``--traceback``."""
+
+    def remember(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+        if value:
+            context.meta[_TRACEBACK] = True
+
+    return click.option(
+        "--traceback",
+        is_flag=True,
+        expose_value=False,
+        callback=remember,
+        help="Show where in the program an error arose.",
+    )(function)

@@ -1,0 +1,200 @@
+"""``geomoe3d register`` and ``register``: two files in, the transform and how sure it is out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+
+if TYPE_CHECKING:
+    from geomoe3d.registration import Explanation
+    from geomoe3d.result import RegistrationResult
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    """What is to be written, each None where it was not asked for."""
+
+    transform: str | None
+    aligned: str | None
+    picture: str | None
+    page: str | None
+
+
+@click.command(context_settings=HELP)
+@click.argument("source", metavar="SOURCE")
+@click.argument("target", metavar="TARGET")
+@click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid, in the clouds' unit. [chosen]")
+@click.option("--seed", metavar="N", help="Same seed, same answer. [0]")
+@click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
+@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
+@click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [none]")
+@click.option("--estimator", metavar="NAME", help="consensus, ransac or svd. [consensus]")
+@click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
+@click.option("--output", metavar="FILE", help="Write the transform: .txt, .npy, or .json (whole result).")
+@click.option("--aligned", metavar="FILE", help="Write SOURCE at full resolution, moved into TARGET.")
+@click.option("--picture", metavar="FILE.png", help="Write a picture of before, matches and after.")
+@click.option("--page", metavar="FILE.html", help="Write a page to turn the clouds in, for any browser.")
+@click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
+@click.option("--force", is_flag=True, help="Replace output files that exist.")
+@click.option("--quiet", is_flag=True, help="No progress; print the four rows of the matrix alone.")
+@traceback_option
+@click.pass_context
+def command(
+    context: click.Context,
+    source: str,
+    target: str,
+    voxel_size: str | None,
+    seed: str | None,
+    config_file: str | None,
+    assignments: tuple[str, ...],
+    filter_name: str | None,
+    estimator: str | None,
+    inverse: bool,
+    as_json: bool,
+    output: str | None,
+    aligned: str | None,
+    picture: str | None,
+    page: str | None,
+    show: bool,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Find the rigid motion that lays SOURCE on TARGET: p_target = R p_source + t.
+
+    SOURCE and TARGET are point clouds or meshes (PLY, PCD, XYZ, NPY, OBJ, STL, LAS, E57, ...). No first
+    guess is needed. The motion is given in the files' own coordinates, with a status: ok,
+    low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
+    """
+    from geomoe3d.config import load_config
+
+    named = {
+        "voxel_size": voxel_size,
+        "seed": seed,
+        "filter.name": filter_name,
+        "estimator.name": estimator,
+    }
+    given = [f"{key}={value}" for key, value in named.items() if value is not None]
+    config = load_config(config_file, [*assignments, *given])
+    outputs = _Outputs(output, aligned, picture, page)
+    _check_outputs(outputs, (source, target), force)
+
+    from geomoe3d.cli.terminal import stage_display, stdout_to_stderr
+
+    with stdout_to_stderr(), stage_display(quiet) as stage:
+        stage("start")  # importing the libraries below takes a second
+        from geomoe3d.registration import Registrar
+
+        registrar = Registrar(config)
+        explanation: Explanation | None = None
+        if picture is not None or page is not None or show:
+            explanation = registrar.explain(source, target, progress=stage)
+            result = explanation.result
+        else:
+            result = registrar.register(source, target, progress=stage)
+    try:
+        with stdout_to_stderr(), stage_display(quiet) as stage:
+            _write(outputs, result, explanation, source, inverse, force, stage)
+    finally:  # a full disk must not cost the answer
+        _print(result.inverse() if inverse else result, as_json, quiet, inverse)
+    if show and explanation is not None:
+        from geomoe3d.visual.explained import explained_view
+        from geomoe3d.visual.window import show_window
+
+        show_window(explained_view(explanation))
+    context.exit(0 if result.ok else NOT_SURE)
+
+
+def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: bool) -> None:
+    if as_json:
+        click.echo(answer.to_json())
+    elif quiet:
+        from geomoe3d.transform_files import has_transform, transform_text
+
+        if has_transform(answer):
+            click.echo(transform_text(answer.T_target_source, []), nl=False)
+    else:
+        from geomoe3d.cli.summary import summary
+
+        color = False if os.environ.get("NO_COLOR") else None
+        click.echo(summary(answer, inverted), color=color)
+
+
+def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> None:
+    """Every output path is refused before the work begins, if it has to be refused at all."""
+    from geomoe3d.clouds.io import SAVE_SUFFIXES
+    from geomoe3d.errors import OutputError
+    from geomoe3d.files import check_output
+    from geomoe3d.transform_files import TRANSFORM_SUFFIXES, check_suffix
+
+    wanted = (
+        ("--output", outputs.transform, TRANSFORM_SUFFIXES),
+        ("--aligned", outputs.aligned, SAVE_SUFFIXES),
+        ("--picture", outputs.picture, (".png",)),
+        ("--page", outputs.page, (".html", ".htm")),
+    )
+    taken = {Path(path).resolve(): "an input" for path in inputs}
+    for option, path, suffixes in wanted:
+        if path is None:
+            continue
+        check_suffix(path, suffixes)
+        check_output(path, force=force)
+        owner = taken.setdefault(Path(path).resolve(), option)
+        if owner != option:
+            raise OutputError(f"{option} '{path}' is also {owner}; give another name")
+
+
+def _write(
+    outputs: _Outputs,
+    result: RegistrationResult,
+    explanation: Explanation | None,
+    source: str,
+    inverse: bool,
+    force: bool,
+    stage: Callable[[str], None],
+) -> None:
+    """Write what was asked for; what needs a transform where there is none is named on stderr."""
+    from geomoe3d import __version__
+    from geomoe3d.cli.summary import direction
+    from geomoe3d.transform_files import has_transform, save_result
+
+    skipped = []
+    if outputs.transform is not None:
+        answer = result.inverse() if inverse else result
+        comments = [
+            direction(answer, inverse),
+            f"status {result.status}, confidence {result.confidence:.4f}, geomoe3d {__version__}",
+        ]
+        if not save_result(outputs.transform, answer, comments, force=force):
+            skipped.append(outputs.transform)
+    if outputs.aligned is not None:
+        stage("write the aligned cloud")
+        if has_transform(result):
+            from geomoe3d.clouds.io import save_aligned
+
+            save_aligned(outputs.aligned, source, result.T_target_source, force=force)
+        else:
+            skipped.append(outputs.aligned)
+    if explanation is not None and (outputs.picture is not None or outputs.page is not None):
+        from geomoe3d.visual.explained import explained_view
+
+        view = explained_view(explanation)
+        if outputs.picture is not None:
+            stage("draw the picture")
+            from geomoe3d.visual.picture import save_picture
+
+            save_picture(view, outputs.picture, force=force)
+        if outputs.page is not None:
+            stage("write the page")
+            from geomoe3d.visual.page import save_page
+
+            save_page(view, outputs.page, force=force)
+    for path in skipped:
+        click.echo(f"not written, for want of a transform: {path}", err=True)

@@ -1,0 +1,28 @@
+"""``geomoe3d sample``: write the generated sample pair."""
+
+from __future__ import annotations
+
+import click
+
+from geomoe3d.cli.errors import HELP, traceback_option
+
+
+@click.command(context_settings=HELP)
+@click.argument("folder", default="sample", metavar="[FOLDER]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another pair.")
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+@traceback_option
+def command(folder: str, seed: int, force: bool) -> None:
+    """Make a pair of scans to try things on.
+
+    Two views of one generated room, as a depth camera sees it, go into FOLDER (default: sample) as
+    source.ply and target.ply, with the true motion in T_target_source.txt. Metres.
+    """
+    from geomoe3d.cli.terminal import stage_display, stdout_to_stderr
+    from geomoe3d.data.sample import write_sample_pair
+
+    with stdout_to_stderr(), stage_display(quiet=False) as stage:
+        stage("sample pair")
+        paths = write_sample_pair(folder, seed=seed, force=force)
+    for path in (paths.source, paths.target, paths.truth):
+        click.echo(path)

@@ -1,0 +1,106 @@
+"""A registration result for the eye: the verdict first, then what it rests on, then the matrix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from geomoe3d.result import CloudReport, RegistrationResult
+from geomoe3d.transform_files import has_transform
+from geomoe3d.types import FloatArray
+
+_COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}
+_MEANING = {
+    "ok": "the transform can be relied on",
+    "low_confidence": "the transform may well be wrong",
+    "ambiguous": "another motion fits about as well",
+    "failed": "no transform can be relied on",
+}
+
+
+def summary(result: RegistrationResult, inverted: bool = False) -> str:
+    """The whole answer as text with terminal colours (`click.echo` drops them where nobody sees them).
+
+    Args:
+        result: what is to be shown.
+        inverted: whether `result` is the inverse of what was asked, its source the user's target.
+    """
+    first, second = (result.target, result.source) if inverted else (result.source, result.target)
+    lines = [
+        click.style(result.status.replace("_", " "), fg=_COLORS[result.status], bold=True)
+        + f": {_MEANING[result.status]} (confidence {result.confidence:.2f})",
+        *(f"  {reason}" for reason in result.reasons),
+        "",
+        _row("overlap", f"{result.overlap:.0%} of the source lies on the target"),
+        _row("inliers", _inliers(result)),
+        _row("voxel size", f"{result.voxel_size:.6g}{_chosen(result)}"),
+        _row("source", _cloud(first)),
+        _row("target", _cloud(second)),
+        _row("alternative", _alternative(result)),
+        _row("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in result.seconds.items())),
+        "",
+        direction(result, inverted),
+    ]
+    if has_transform(result):
+        lines.append(matrix_text(result.T_target_source))
+    else:
+        lines.append("no transform was found")
+    return "\n".join(lines)
+
+
+def direction(result: RegistrationResult, inverted: bool = False) -> str:
+    """Which way the transform maps, in one sentence with the names of the clouds."""
+    first, second = Path(result.source.name).name, Path(result.target.name).name
+    if inverted:
+        return f"maps TARGET ({first}) into SOURCE ({second}): p_source = R p_target + t"
+    return f"maps SOURCE ({first}) into TARGET ({second}): p_target = R p_source + t"
+
+
+def matrix_text(T: FloatArray) -> str:
+    """Four rows; 15 decimals for the rotation, and the translation to 1e-9 of the unit."""
+    cells = [[f"{value:.15f}" for value in row[:3]] + [f"{row[3]:.9f}"] for row in T]
+    widths = [max(len(row[column]) for row in cells) for column in range(4)]
+    return "\n".join(
+        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in cells
+    )
+
+
+def _row(name: str, text: str) -> str:
+    return f"{name:12}{text}"
+
+
+def _inliers(result: RegistrationResult) -> str:
+    return (
+        f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences agree "
+        f"within {result.inlier_threshold:.6g}"
+    )
+
+
+def _chosen(result: RegistrationResult) -> str:
+    given = result.config.get("voxel_size") is not None
+    return "" if given else " (chosen from the clouds; --voxel-size sets it)"
+
+
+def _cloud(cloud: CloudReport) -> str:
+    dropped = [
+        f"{count:,} {what}"
+        for count, what in (
+            (cloud.num_non_finite, "non-finite"),
+            (cloud.num_duplicates, "duplicates"),
+            (cloud.num_isolated, "isolated voxels"),
+        )
+        if count
+    ]
+    text = f"{cloud.name}: {cloud.num_input:,} points in, {cloud.num_points:,} voxel points used"
+    return text + (f"; dropped {', '.join(dropped)}" if dropped else "; nothing dropped")
+
+
+def _alternative(result: RegistrationResult) -> str:
+    other = result.alternative
+    if other is None:
+        return "no clearly different motion comes near"
+    return (
+        f"another motion scores {other.relative_score:.2f} of this one, "
+        f"{other.rotation_difference_deg:.1f} deg and {other.translation_difference:.4g} away"
+    )

@@ -1,0 +1,60 @@
+"""What goes to the screen while a verb works: the name of the stage on stderr, nothing on stdout.
+
+Open3D's native code prints warnings to stdout, where a program that reads ``--json`` would stumble over
+them; `stdout_to_stderr` sends them the other way.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+
+
+@contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """Whatever is printed inside, by Python or by native code, goes to stderr."""
+    sys.stdout.flush()
+    try:
+        kept = os.dup(1)
+    except OSError:  # the process was started without a stdout
+        kept = -1
+    try:
+        if kept >= 0:
+            os.dup2(2, 1)
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if kept >= 0:
+            os.dup2(kept, 1)
+            os.close(kept)
+
+
+@contextmanager
+def stage_display(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A line on stderr with the stage at work and the time it has taken; gone when done.
+
+    Args:
+        quiet: shows nothing. Neither is anything shown where stderr is no terminal.
+
+    Yields:
+        Call it with the name of each stage as it begins.
+    """
+    if quiet or not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        yield lambda stage: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    with Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=False,
+    ) as progress:
+        task = progress.add_task("start", total=None)
+        yield lambda stage: progress.update(task, description=stage)

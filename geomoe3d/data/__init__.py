@@ -1,0 +1,1 @@
+"""Where clouds come from besides the user's files."""

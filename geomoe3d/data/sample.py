@@ -1,0 +1,164 @@
+"""The sample pair: two views of one generated furnished room, as a depth camera would see them.
+
+Each view is what an RGB-D fragment is: a few depth frames of a camera that turns by some degrees, laid
+together in the frame of its first pose, so that the camera stands at the origin. Depth carries the noise
+of a structured-light sensor, surfaces seen at a grazing angle drop out, and nothing beyond the sensor's
+range is seen. The room has no symmetry, so that exactly one motion is right, and that one is known.
+About two seconds and 200 MB, most of it the import of Open3D, which casts the rays.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.data.sample_room import Room, furnished_room
+from geomoe3d.errors import InputError, OutputError
+from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
+from geomoe3d.types import FloatArray, PointCloud
+
+_WIDTH, _HEIGHT, _FOCAL = 320, 240, 262.5  # half a Kinect: 63 by 49 degrees
+_NEAR, _FAR = 0.4, 4.5
+_GRID = 0.0125  # one point is kept per voxel of this edge, as fusing the frames of a fragment does
+
+
+@dataclass(frozen=True)
+class SamplePaths:
+    """Files of a written sample pair."""
+
+    source: Path
+    target: Path
+    truth: Path
+
+
+def make_sample_pair(seed: int = 0) -> tuple[PointCloud, PointCloud, FloatArray]:
+    """Two views of one generated room and the motion between them.
+
+    Args:
+        seed: decides the clutter, the camera's exact path and the noise; same seed, same arrays.
+
+    Returns:
+        Source and target, each in metres in the frame of its own first camera (x right, y down, z into
+        the room, the camera at the origin), coloured by object; and T_target_source (4, 4).
+
+    Raises:
+        InputError: the seed is negative.
+    """
+    if seed < 0:
+        raise InputError(f"the seed must not be negative, found {seed}")
+    rng = np.random.default_rng(seed)
+    room = furnished_room(rng)
+    source, T_world_source = _view(room, (0.75, 0.70, 1.50), (22.0, 44.0, 66.0), "source", rng)
+    target, T_world_target = _view(room, (2.35, 0.45, 1.35), (74.0, 99.0, 124.0), "target", rng)
+    return source, target, inverse(T_world_target) @ T_world_source
+
+
+def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool = False) -> SamplePaths:
+    """Write source.ply, target.ply and T_target_source.txt, the true motion, into a folder.
+
+    Args:
+        folder: is made if it does not exist.
+        seed: as in `make_sample_pair`; same seed, same bytes.
+        force: True replaces files of an earlier pair.
+
+    Raises:
+        OutputError: the folder cannot be made or written, or a file exists and ``force`` is False; then
+            nothing has been written.
+        InputError: the seed is negative.
+    """
+    from geomoe3d.clouds.io import save_points
+    from geomoe3d.files import check_output
+    from geomoe3d.transform_files import save_transform
+
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    paths = SamplePaths(folder / "source.ply", folder / "target.ply", folder / "T_target_source.txt")
+    for path in (paths.source, paths.target, paths.truth):
+        check_output(path, force=force)
+    source, target, T_target_source = make_sample_pair(seed)
+    save_points(paths.source, source, force=force)
+    save_points(paths.target, target, force=force)
+    save_transform(
+        paths.truth,
+        T_target_source,
+        ["the true motion of the sample pair", "maps source.ply into target.ply: p_target = R p_source + t"],
+        force=force,
+    )
+    return paths
+
+
+def _camera_pose(
+    eye: tuple[float, float, float] | FloatArray, yaw_deg: float, pitch_deg: float, roll_deg: float
+) -> FloatArray:
+    """T_world_camera of a camera that looks along its z, x right and y down."""
+    yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    R = np.column_stack([c * right + s * down, c * down - s * right, forward])
+    return make_transform(R, np.asarray(eye, dtype=np.float64))
+
+
+def _view(
+    room: Room,
+    eye: tuple[float, float, float],
+    yaws_deg: tuple[float, ...],
+    name: str,
+    rng: np.random.Generator,
+) -> tuple[PointCloud, FloatArray]:
+    """Frames of a camera that turns on the spot, nearly; in the frame of the first, with its pose."""
+    poses = [
+        _camera_pose(
+            np.asarray(eye) + rng.uniform(-0.06, 0.06, 3),
+            yaw + rng.uniform(-3, 3),
+            rng.uniform(-22, -14),
+            rng.uniform(-4, 4),
+        )
+        for yaw in yaws_deg
+    ]
+    scene, face_colors = room.scene(), np.concatenate(room.colors)
+    parts, colors = [], []
+    for pose in poses:
+        points, color = _depth_frame(scene, face_colors, pose, rng)
+        parts.append(transform_points(inverse(poses[0]) @ pose, points))
+        colors.append(color)
+    points, color = np.concatenate(parts), np.concatenate(colors)
+    _, first = np.unique(np.floor(points / _GRID).astype(np.int64), axis=0, return_index=True)
+    keep = np.sort(first)
+    # As a PLY of a scanner holds them: single precision, 8 bits per colour.
+    points = points[keep].astype(np.float32).astype(np.float64)
+    return PointCloud(points, colors=np.round(color[keep] * 255) / 255, name=name), poses[0]
+
+
+def _depth_frame(
+    scene: Any, face_colors: FloatArray, T_world_camera: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """One depth image as (n, 3) points in the camera's frame and their (n, 3) colours."""
+    import open3d as o3d
+
+    u, v = np.meshgrid(np.arange(_WIDTH) - (_WIDTH - 1) / 2, np.arange(_HEIGHT) - (_HEIGHT - 1) / 2)
+    rays = np.stack([u / _FOCAL, v / _FOCAL, np.ones_like(u)], axis=-1).reshape(-1, 3)  # z = 1: t is depth
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    bundle = np.column_stack([np.broadcast_to(t, rays.shape), rays @ R.T]).astype(np.float32)
+    hits = scene.cast_rays(o3d.core.Tensor.from_numpy(bundle))
+    depth = hits["t_hit"].numpy().astype(np.float64)
+    normals = hits["primitive_normals"].numpy().astype(np.float64)
+    triangle = hits["primitive_ids"].numpy()
+
+    directions = bundle[:, 3:] / np.linalg.norm(bundle[:, 3:], axis=1, keepdims=True)
+    slope = np.abs(np.einsum("ij,ij->i", directions, normals))
+    dropped = rng.uniform(size=len(depth)) > np.clip((slope - 0.05) / 0.20, 0, 1)
+    sigma = np.clip(0.0015 * np.where(np.isfinite(depth), depth, 0.0) ** 2, 0.003, 0.015)
+    noisy = depth + sigma * rng.standard_normal(len(depth))
+    seen = np.isfinite(depth) & (depth > _NEAR) & (depth < _FAR) & ~dropped
+    points: FloatArray = rays[seen] * noisy[seen, None]
+    return points, face_colors[triangle[seen]]

@@ -1,0 +1,1 @@
+"""From a file or an array to a cloud ready for description: reading, writing, preparation and features."""

@@ -1,0 +1,133 @@
+"""E57 (extra ``geomoe3d[e57]``, pye57): all scans of a file in its global frame, read only.
+
+Fields are read as doubles through libE57 itself; pye57's own reader assumes 8 bit colours and an order of
+the quaternion's members. Its writer stores single precision, so E57 is not written.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
+from geomoe3d.errors import DependencyError, FormatError
+from geomoe3d.types import FloatArray
+
+_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_COLORS = ("colorRed", "colorGreen", "colorBlue")
+
+
+def read_e57(path: Path) -> RawCloud:
+    """Points of all scans, each moved by its pose; points that the file marks invalid are left out.
+
+    Colours are kept when every scan has them.
+
+    Raises:
+        FormatError: no E57 file, truncated, or damaged.
+        DependencyError: pye57 is absent.
+    """
+    try:
+        import pye57
+    except ImportError:
+        raise DependencyError(
+            "E57 files need pye57, which is not installed: pip install 'geomoe3d[e57]'"
+        ) from None
+    _check_size(path)
+    try:
+        with pye57.E57(str(path)) as file:
+            scans = [_read_scan(pye57.libe57, file, index) for index in range(file.scan_count)]
+    except FormatError:
+        raise
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise FormatError(f"'{path}' is no E57 file or damaged: {reason[0]}") from None
+    scans = [scan for scan in scans if len(scan.points)]
+    if not scans:
+        return RawCloud(np.empty((0, 3)))
+    colors = [scan.colors for scan in scans if scan.colors is not None]
+    return RawCloud(
+        np.concatenate([scan.points for scan in scans]),
+        colors=np.concatenate(colors) if len(colors) == len(scans) else None,
+    )
+
+
+def _check_size(path: Path) -> None:
+    """The header names the file's length; libE57 complains about a wrong one without numbers."""
+    with path.open("rb") as handle:
+        head = handle.read(24)
+    if len(head) < 24 or head[:8] != b"ASTM-E57":
+        raise FormatError(f"'{path}' is no E57 file: it does not start with 'ASTM-E57'")
+    said, held = struct.unpack("<Q", head[16:24])[0], path.stat().st_size
+    if said != held:
+        raise FormatError(f"'{path}': the header says {said} bytes, the file holds {held}; it is truncated")
+
+
+def _read_scan(libe57: Any, file: Any, index: int) -> RawCloud:
+    header = file.get_header(index)
+    count, present = header.point_count, set(header.point_fields)
+    if not count:
+        return RawCloud(np.empty((0, 3)))
+    axes = _CARTESIAN if set(_CARTESIAN) <= present else _SPHERICAL
+    if not set(axes) <= present:
+        raise FormatError(
+            f"'{file.path}': scan {index} has no coordinates, only: {', '.join(sorted(present))}"
+        )
+    state = "cartesianInvalidState" if axes is _CARTESIAN else "sphericalInvalidState"
+    wanted = [*axes, *(_COLORS if set(_COLORS) <= present else ()), *([state] if state in present else [])]
+    data = {name: np.empty(count) for name in wanted}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, array in data.items():
+        # The two flags: convert any stored type to double, and apply the scale of scaled integers.
+        buffers.append(libe57.SourceDestBuffer(file.image_file, name, array, count, True, True))
+    held = header.points.reader(buffers).read()
+    if held != count:
+        raise FormatError(f"'{file.path}': scan {index} says {count} points, the file holds {held}")
+    points = np.stack([data[name] for name in axes], axis=1)
+    if axes is _SPHERICAL:
+        points = _cartesian(points)
+    rotation, translation = _pose(header.node)
+    points = points @ rotation.T + translation
+    cloud = RawCloud(points)
+    if _COLORS[0] in data:
+        colors = np.stack([data[name] for name in _COLORS], axis=1)
+        cloud = RawCloud(points, colors=_scaled_colors(header.node, colors))
+    return cloud.take(data[state] == 0) if state in data else cloud
+
+
+def _cartesian(spherical: FloatArray) -> FloatArray:
+    """x = r cos(el) cos(az), y = r cos(el) sin(az), z = r sin(el); ASTM E2807, spherical coordinates."""
+    reach, azimuth, elevation = spherical.T
+    flat = reach * np.cos(elevation)
+    points: FloatArray = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), reach * np.sin(elevation)], 1
+    )
+    return points
+
+
+def _pose(node: Any) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and translation (3,): p_file = R p_scan + t; the identity where the scan has none."""
+    rotation, translation = np.eye(3), np.zeros(3)
+    if not node.isDefined("pose"):
+        return rotation, translation
+    pose = node["pose"]
+    if pose.isDefined("translation"):
+        translation = np.array([pose["translation"][axis].value() for axis in "xyz"], dtype=np.float64)
+    if pose.isDefined("rotation"):
+        w, x, y, z = (pose["rotation"][part].value() for part in "wxyz")
+        from scipy.spatial.transform import Rotation
+
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+    return rotation, translation
+
+
+def _scaled_colors(node: Any, colors: FloatArray) -> FloatArray | None:
+    """Colours over the limit that the file states, else by the general rule."""
+    if node.isDefined("colorLimits") and node["colorLimits"].isDefined("colorRedMaximum"):
+        limit = float(node["colorLimits"]["colorRedMaximum"].value())
+        if limit > 0 and colors.min() >= 0 and colors.max() <= limit:
+            return colors / limit
+    return scale_colors(colors)

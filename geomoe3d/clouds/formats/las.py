@@ -1,0 +1,110 @@
+"""LAS and LAZ (extra ``geomoe3d[las]``, laspy with lazrs): exact float64 coordinates and 16 bit colours."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors
+from geomoe3d.errors import DependencyError, FormatError
+
+_LARGEST = 2_000_000_000  # of the signed 32 bit integers that LAS stores, with a margin
+
+
+def _laspy(compressed: bool) -> Any:
+    try:
+        import laspy
+    except ImportError:
+        raise DependencyError(
+            "LAS and LAZ files need laspy, which is not installed: pip install 'geomoe3d[las]'"
+        ) from None
+    if compressed and not laspy.LazBackend.detect_available():
+        raise DependencyError("LAZ files need lazrs, which is not installed: pip install 'geomoe3d[las]'")
+    return laspy
+
+
+def read_las(path: Path) -> RawCloud:
+    """Coordinates X * scale + offset in float64, with colours, and normals if extra dimensions name them.
+
+    Colours are 16 bit by the standard; a file whose largest value fits 8 bits is taken as 8 bit, and one
+    with nothing but zeros as having none.
+
+    Raises:
+        FormatError: no LAS file, damaged, or a count in the header that the content does not bear out.
+        DependencyError: laspy (or lazrs for LAZ) is absent.
+    """
+    laspy = _laspy(path.suffix.lower() == ".laz")
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+            _check_size(path, header)
+            las = reader.read()
+    except (FormatError, PermissionError):
+        raise
+    except BaseException as error:  # lazrs may panic on damaged data, which is no Exception
+        if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError)):
+            raise
+        raise FormatError(f"'{path}' is no LAS file or damaged: {error}") from None
+    num_points = len(las.points)
+    if num_points != header.point_count:
+        raise _wrong_count(path, header.point_count, num_points)
+    points = np.empty((num_points, 3))
+    for k, axis in enumerate((las.x, las.y, las.z)):
+        points[:, k] = axis
+    names = list(las.point_format.dimension_names)
+    groups = columns_by_name(names)
+    colors = normals = None
+    if {"red", "green", "blue"} <= set(names):
+        stored = np.stack([np.asarray(las[name]) for name in ("red", "green", "blue")], axis=1)
+        colors = scale_colors(stored) if stored.any() else None
+    if "normals" in groups:
+        normals = np.stack([np.asarray(las[names[k]], dtype=np.float64) for k in groups["normals"]], axis=1)
+    return RawCloud(points, normals, colors)
+
+
+def _wrong_count(path: Path, said: int, held: int) -> FormatError:
+    reason = "it is truncated or its header is wrong" if held < said else "its header is wrong"
+    return FormatError(f"'{path}': the header says {said} points, the file holds {held}; {reason}")
+
+
+def _check_size(path: Path, header: Any) -> None:
+    """Hold the count of an uncompressed file against its size, which laspy does not."""
+    if header.are_points_compressed:
+        return
+    held = (path.stat().st_size - header.offset_to_point_data) // header.point_format.size
+    followed = getattr(header, "number_of_evlrs", 0) or getattr(
+        header, "start_of_waveform_data_packet_record", 0
+    )
+    if held < header.point_count or (held > header.point_count and not followed):
+        raise _wrong_count(path, header.point_count, max(held, 0))
+
+
+def write_las(handle: BinaryIO, cloud: RawCloud, compressed: bool) -> None:
+    """LAS 1.2 or LAZ; coordinates on a grid of a power of ten that is at most 1e-8 of the cloud's extent.
+
+    LAS stores 32 bit integers times a scale. The scale is the finest power of ten that spans the cloud (1e-7
+    for 100 units), so a coordinate moves by at most half of it. Colours are 16 bit, normals extra dimensions.
+    """
+    laspy = _laspy(compressed)
+    header = laspy.LasHeader(point_format=2 if cloud.colors is not None else 0, version="1.2")
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    offset = np.floor((low + high) / 2.0)
+    reach = max(float(np.abs(high - offset).max()), float(np.abs(low - offset).max()), 1e-3)
+    header.offsets = offset
+    header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST)))
+    if cloud.normals is not None:
+        header.add_extra_dims([laspy.ExtraBytesParams(name=f"normal_{axis}", type="f8") for axis in "xyz"])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.points.T
+    if cloud.normals is not None:
+        for k, axis in enumerate("xyz"):
+            las[f"normal_{axis}"] = cloud.normals[:, k]
+    if cloud.colors is not None:
+        stored = np.rint(cloud.colors * 65535.0)
+        if stored.max() <= 255:  # readers, this one too, would take them for 8 bit values
+            stored = np.rint(cloud.colors * 255.0) * 257.0
+        las.red, las.green, las.blue = stored.astype(np.uint16).T
+    las.write(handle, do_compress=compressed)

@@ -1,0 +1,247 @@
+"""Meshes: OBJ, STL, OFF, GLB and GLTF through trimesh, surface sampling, and writing a moved mesh.
+
+Sampling M points on F faces is O(F + M log F). Counts that STL, OFF and GLB state are held against the file
+first; OBJ states none, so a truncated OBJ can only be noticed when a face names a missing vertex.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
+from geomoe3d.clouds.formats.text import write_rows
+from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.errors import EmptyCloudError, FormatError, InputError
+from geomoe3d.geometry.se3 import make_transform, transform_points
+from geomoe3d.types import BoolArray, FloatArray, IntArray
+
+
+def load_scene(path: Path) -> Any:
+    """What trimesh makes of a mesh file: a mesh, a cloud or a scene.
+
+    Raises:
+        FormatError: trimesh refuses the file, or a stated count or length is not borne out.
+    """
+    suffix = path.suffix.lower()
+    check = {".stl": _check_stl, ".off": _check_off, ".glb": _check_glb}.get(suffix)
+    if check is not None:
+        check(path)
+    import trimesh
+
+    try:
+        return trimesh.load(str(path), process=False)
+    except (MemoryError, PermissionError):
+        raise
+    except Exception as error:  # trimesh's loaders let all kinds of errors through
+        kind = suffix[1:].upper()
+        raise FormatError(f"'{path}' cannot be read as {kind}: {type(error).__name__}: {error}") from None
+
+
+def read_mesh(path: Path) -> RawCloud:
+    """All geometry of a mesh file in one frame, transforms of the scene graph applied."""
+    return flatten(load_scene(path), f"'{path}'")
+
+
+def _check_stl(path: Path) -> None:
+    size = path.stat().st_size
+    with path.open("rb") as handle:
+        head = handle.read(84)
+        said = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else -1
+        if size == 84 + 50 * said:
+            return
+        if head.lstrip().startswith(b"solid"):
+            handle.seek(max(0, size - 200))
+            if b"endsolid" not in handle.read():
+                raise FormatError(f"'{path}' is truncated: an ASCII STL ends with 'endsolid'")
+            return
+    held = max(0, size - 84) // 50
+    raise FormatError(
+        f"'{path}': the header says {max(said, 0)} faces, the file holds {held}; it is truncated or no STL"
+    )
+
+
+def _check_off(path: Path) -> None:
+    with path.open(encoding="latin-1") as handle:
+        words = (line.partition("#")[0].split() for line in handle)
+        rows = [row for row in words if row]
+    if not rows or not rows[0][0].upper().endswith("OFF"):
+        raise FormatError(f"'{path}' is no OFF file: its first line is not 'OFF'")
+    counts = rows[0][1:] if len(rows[0]) > 1 else rows[1] if len(rows) > 1 else []
+    first = 1 if len(rows[0]) > 1 else 2
+    if len(counts) < 2 or not all(count.isdigit() for count in counts[:2]):
+        raise FormatError(f"'{path}': the OFF header states no counts of vertices and faces")
+    said, held = int(counts[0]) + int(counts[1]), len(rows) - first
+    if said > held:
+        raise FormatError(
+            f"'{path}': the header says {counts[0]} vertices and {counts[1]} faces, that is {said} lines; "
+            f"the file holds {held}; it is truncated or its header is wrong"
+        )
+
+
+def _check_glb(path: Path) -> None:
+    with path.open("rb") as handle:
+        head = handle.read(12)
+    if len(head) < 12 or head[:4] != b"glTF":
+        raise FormatError(f"'{path}' is no GLB file: it does not start with 'glTF'")
+    said, held = struct.unpack("<I", head[8:12])[0], path.stat().st_size
+    if said > held:
+        raise FormatError(f"'{path}': the header says {said} bytes, the file holds {held}; it is truncated")
+
+
+def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
+    """Vertices and triangles of a trimesh mesh, cloud or scene in one frame.
+
+    Parts without faces count only where no part has any.
+
+    Raises:
+        EmptyCloudError: the object holds neither a mesh nor points.
+        FormatError: a face names a missing vertex.
+    """
+    parts = []
+    for item, T in _placed(geometry):
+        vertices = transform_points(T, np.asarray(item.vertices, dtype=np.float64))
+        faces = (
+            np.asarray(item.faces, dtype=np.int64) if hasattr(item, "faces") else np.empty((0, 3), np.int64)
+        )
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise FormatError(
+                f"{what}: a face names vertex {faces.max()}, there are {len(vertices)} vertices"
+            )
+        parts.append(RawCloud(vertices, None, _vertex_colors(item), faces))
+    if not sum(len(part.points) for part in parts):
+        raise EmptyCloudError(f"{what} holds 0 points: no mesh and no point cloud")
+    if any(_num_faces(part) for part in parts):
+        parts = [part for part in parts if _num_faces(part)]
+    starts = np.cumsum([0] + [len(part.points) for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    colors = [part.colors for part in parts if part.colors is not None]
+    return RawCloud(
+        np.concatenate([part.points for part in parts]),
+        colors=np.concatenate(colors) if len(colors) == len(parts) else None,
+        faces=faces if len(faces) else None,
+    )
+
+
+def _num_faces(part: RawCloud) -> int:
+    return 0 if part.faces is None else len(part.faces)
+
+
+def _placed(geometry: Any) -> list[tuple[Any, FloatArray]]:
+    """Each part that has vertices, with the affine (4, 4) that places it: p_file = A p_part + t."""
+    if not hasattr(geometry, "graph"):
+        return [(geometry, np.eye(4))] if hasattr(geometry, "vertices") else []
+    placed = []
+    for node in geometry.graph.nodes_geometry:
+        T, name = geometry.graph[node]
+        item = geometry.geometry[name]
+        if hasattr(item, "faces") or type(item).__name__ == "PointCloud":
+            placed.append((item, np.asarray(T, dtype=np.float64)))
+    return placed
+
+
+def _vertex_colors(item: Any) -> FloatArray | None:
+    if getattr(item.visual, "kind", None) != "vertex":
+        return None
+    return scale_colors(np.asarray(item.visual.vertex_colors)[:, :3])
+
+
+def without_vertices(mesh: RawCloud, kept: BoolArray) -> RawCloud:
+    """The vertices of a mask, and the faces of which every corner is kept; None where no face is left."""
+    assert mesh.faces is not None
+    rows = np.cumsum(kept) - 1
+    faces: IntArray = rows[mesh.faces[kept[mesh.faces].all(axis=1)]]
+    return replace(mesh.take(kept), faces=faces if len(faces) else None)
+
+
+def sample_surface(mesh: RawCloud, num_points: int, seed: int, what: str) -> FloatArray:
+    """Points (num_points, 3) spread evenly over the area of a finite mesh, the same for the same seed.
+
+    Raises:
+        InputError: the surface has no area.
+    """
+    import trimesh
+
+    origin = choose_origin(mesh.points)  # areas of small triangles far from zero would drown in rounding
+    body = trimesh.Trimesh(mesh.points - origin, mesh.faces, process=False)
+    if not body.area > 0:
+        raise InputError(f"{what}: all {_num_faces(mesh)} faces of the mesh are degenerate (area 0)")
+    points = trimesh.sample.sample_surface(body, num_points, seed=seed)[0]
+    return np.asarray(points, dtype=np.float64) + origin
+
+
+def write_obj(handle: BinaryIO, mesh: RawCloud) -> None:
+    """Wavefront OBJ: vertices in full precision, with colours behind the coordinates, and triangles."""
+    parts = [mesh.points] if mesh.colors is None else [mesh.points, mesh.colors]
+    write_rows(handle, parts, prefix="v ")
+    _write_faces(handle, mesh, "f ", 1)
+
+
+def write_off(handle: BinaryIO, mesh: RawCloud) -> None:
+    """OFF: vertices in full precision and triangles, no colours."""
+    handle.write(f"OFF\n{len(mesh.points)} {_num_faces(mesh)} 0\n".encode("ascii"))
+    write_rows(handle, [mesh.points])
+    _write_faces(handle, mesh, "3 ", 0)
+
+
+def _write_faces(handle: BinaryIO, mesh: RawCloud, prefix: str, first: int) -> None:
+    assert mesh.faces is not None
+    lines = [f"{prefix}{a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist()]
+    handle.write("".join(lines).encode("ascii"))
+
+
+def write_stl(handle: BinaryIO, mesh: RawCloud) -> None:
+    """STL: binary (single precision) near zero, ASCII with every digit far from it; no colours."""
+    assert mesh.faces is not None
+    corners = mesh.points[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    if choose_origin(mesh.points).any():
+        handle.write(b"solid geomoe3d\n")
+        for normal, corner in zip(normals.tolist(), corners.tolist(), strict=True):
+            lines = [f"facet normal {normal[0]:.6g} {normal[1]:.6g} {normal[2]:.6g}", "outer loop"]
+            lines += [f"vertex {x!r} {y!r} {z!r}" for x, y, z in corner]
+            handle.write(("\n".join([*lines, "endloop", "endfacet"]) + "\n").encode("ascii"))
+        handle.write(b"endsolid geomoe3d\n")
+        return
+    rows = np.zeros(
+        len(corners), dtype=np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("tag", "<u2")])
+    )
+    rows["normal"], rows["corners"] = normals, corners
+    handle.write(b"geomoe3d".ljust(80) + struct.pack("<I", len(rows)) + rows.tobytes())
+
+
+def write_glb(handle: BinaryIO, geometry: Any, T: FloatArray) -> None:
+    """GLB of a trimesh object or scene moved by T (4, 4), with its materials.
+
+    GLB vertices are single precision, so each part is centred and its place goes into the node's matrix,
+    which is text with all digits.
+    """
+    import trimesh
+
+    scene: Any = trimesh.Scene()
+    for item, place in _placed(geometry):
+        part = item.copy()
+        center = choose_origin(np.asarray(part.vertices, dtype=np.float64))
+        part.vertices = np.asarray(part.vertices) - center
+        scene.add_geometry(part, transform=T @ place @ make_transform(np.eye(3), center))
+    handle.write(scene.export(file_type="glb"))
+
+
+def scene_of(source: Any, mesh: RawCloud) -> Any:
+    """A trimesh object of the source: the file or object itself where trimesh knows it, for its materials."""
+    import trimesh
+
+    if isinstance(source, (str, os.PathLike)):
+        if Path(source).suffix.lower() != ".ply":
+            return load_scene(Path(source))
+    elif isinstance(source, trimesh.parent.Geometry):
+        return source
+    colors = None if mesh.colors is None else np.rint(mesh.colors * 255.0).astype(np.uint8)
+    return trimesh.Trimesh(mesh.points, mesh.faces, vertex_colors=colors, process=False)

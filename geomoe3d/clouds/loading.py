@@ -1,0 +1,195 @@
+"""From a path, an array or a library's object to a recentred `PointCloud`.
+
+The first step of the pipeline. Reading is O(N); a PLY of N points peaks at about twice the float64 array.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.clouds.formats import arrays, e57, las, meshes, objects, pcd, ply, text
+from geomoe3d.clouds.formats.raw import RawCloud
+from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.errors import EmptyCloudError, FormatError, InputError, NonFiniteError
+from geomoe3d.types import BoolArray, FloatArray, PointCloud
+
+MAX_COORDINATE = 1e12
+DENSE_MESH_VERTICES = 50_000
+
+_READERS: dict[str, Callable[[Path], RawCloud]] = {
+    ".ply": ply.read_ply,
+    ".pcd": pcd.read_pcd,
+    ".xyz": text.read_text,
+    ".txt": text.read_text,
+    ".csv": text.read_text,
+    ".npy": arrays.read_npy,
+    ".npz": arrays.read_npz,
+    ".obj": meshes.read_mesh,
+    ".stl": meshes.read_mesh,
+    ".off": meshes.read_mesh,
+    ".glb": meshes.read_mesh,
+    ".gltf": meshes.read_mesh,
+    ".las": las.read_las,
+    ".laz": las.read_las,
+    ".e57": e57.read_e57,
+}
+READABLE_SUFFIXES = tuple(_READERS)
+
+
+def load_points(
+    data: Any, *, seed: int = 0, mesh_points: int = 100_000, name: str | None = None
+) -> PointCloud:
+    """The finite points of ``data`` in local coordinates, file coordinate = points + origin.
+
+    Formats, by suffix in any case: PLY, PCD, XYZ/TXT/CSV, NPY, NPZ, the meshes OBJ, STL, OFF, GLB and GLTF,
+    LAS/LAZ (extra ``geomoe3d[las]``) and E57 (extra ``geomoe3d[e57]``). Columns of text and of NPY files
+    without names follow `formats.raw.split_columns`.
+
+    Meshes are sampled evenly over their surface, without normals and colours. The exception is a PLY file
+    with faces and at least 50 000 vertices: that is a dense reconstruction, whose vertices are the cloud.
+
+    The origin follows `recentre.choose_origin`. Normals are brought to length 1; if any is zero or not
+    finite all are dropped. Colours are in [0, 1].
+
+    Args:
+        data: a path (str or Path); an array-like of shape (N, 3), floats or integers of any size; a torch
+            tensor; an Open3D PointCloud or TriangleMesh (legacy or tensor); a trimesh mesh, cloud or scene;
+            or a PointCloud, which is returned as it is.
+        seed: decides the points sampled on a mesh.
+        mesh_points: points sampled on a mesh, at least 1.
+        name: what to call the cloud in messages; None takes the file name, or "cloud" for data in memory.
+
+    Returns:
+        A cloud of at least one point that shares no memory with ``data`` (a given PointCloud excepted).
+
+    Raises:
+        InputError: no such file, a directory, not readable, an array of another shape or type, a mesh
+            without area, or a coordinate beyond 1e12, where float64 no longer resolves fine detail.
+        FormatError: an unknown suffix, or a file that is malformed, truncated or belies its header.
+        EmptyCloudError: no points.
+        NonFiniteError: every point has a NaN or infinite coordinate.
+        DependencyError: the format's optional library is not installed.
+    """
+    if isinstance(data, PointCloud):
+        return data if name is None else replace(data, name=name)
+    if mesh_points < 1:
+        raise InputError(f"mesh_points is {mesh_points}, expected at least 1")
+    raw = read_raw(data)
+    label = name if name is not None else Path(data).name if _is_path(data) else "cloud"
+    what = describe(data) if name is None or _is_path(data) else f"'{name}'"
+    cloud, num_non_finite = finite_part(raw, what)
+    if is_sampled(data, cloud):
+        cloud = RawCloud(meshes.sample_surface(cloud, mesh_points, seed, what))
+    origin = choose_origin(cloud.points)
+    points = cloud.points - origin if origin.any() else cloud.points
+    return PointCloud(
+        points=points,
+        origin=origin,
+        normals=None if cloud.normals is None else _unit(cloud.normals),
+        colors=cloud.colors,
+        name=label,
+        num_non_finite=num_non_finite,
+    )
+
+
+def describe(data: Any) -> str:
+    """What to call given data in messages."""
+    return f"'{os.fspath(data)}'" if _is_path(data) else "the cloud"
+
+
+def is_sampled(data: Any, raw: RawCloud) -> bool:
+    """Whether a mesh gives sampled surface points (True) or, as a cloud or a dense PLY, its vertices."""
+    if raw.faces is None:
+        return False
+    is_ply = _is_path(data) and Path(data).suffix.lower() == ".ply"
+    return not (is_ply and len(raw.points) >= DENSE_MESH_VERTICES)
+
+
+def read_raw(data: Any) -> RawCloud:
+    """Everything `load_points` accepts, in file coordinates, nothing dropped, meshes with their faces.
+
+    Raises:
+        InputError, FormatError, EmptyCloudError, DependencyError: as `load_points`.
+    """
+    if isinstance(data, PointCloud):
+        return RawCloud(data.file_points, data.normals, data.colors)
+    if not _is_path(data):
+        return objects.raw_from_object(data)
+    path = Path(data)
+    try:
+        if path.is_dir():
+            raise InputError(f"'{path}' is a directory; pass one file of it")
+        size = path.stat().st_size
+        reader = _READERS.get(path.suffix.lower())
+        if reader is None:
+            raise FormatError(unknown_suffix(path, READABLE_SUFFIXES, "readable"))
+        if size == 0:
+            raise EmptyCloudError(f"'{path}' is an empty file (0 bytes)")
+        return reader(path)
+    except FileNotFoundError as error:
+        if error.filename is not None and Path(error.filename) != path:
+            raise FormatError(f"'{path}' refers to a missing file '{error.filename}'") from None
+        raise InputError(f"there is no file '{path}'; check the path (folder now: {Path.cwd()})") from None
+    except PermissionError:
+        raise InputError(f"'{path}' may not be read: permission denied; check its owner and mode") from None
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
+
+
+def _is_path(data: Any) -> bool:
+    return isinstance(data, (str, os.PathLike))
+
+
+def unknown_suffix(path: Path, known: tuple[str, ...], verb: str) -> str:
+    """A message that names the nearest known suffix and all of them."""
+    suffix = path.suffix.lower()
+    listed = f"{verb}: {', '.join(known)}"
+    if not suffix:
+        return f"'{path}' has no suffix to tell its format; {listed}"
+    close = difflib.get_close_matches(suffix, known, n=1, cutoff=0.5)
+    nearest = f"did you mean {close[0]}? " if close else ""
+    return f"'{path}' has the unknown suffix '{path.suffix}'; {nearest}{listed}"
+
+
+def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
+    """A cloud or mesh without the points that hold NaN or infinities, and their number.
+
+    Raises:
+        EmptyCloudError: no points at all.
+        NonFiniteError: no finite point.
+        InputError: a finite coordinate beyond `MAX_COORDINATE`.
+    """
+    num_points = len(raw.points)
+    if not num_points:
+        raise EmptyCloudError(f"{what} holds 0 points; at least 1 is needed")
+    finite: BoolArray = np.asarray(np.isfinite(raw.points).all(axis=1))
+    num_non_finite = num_points - int(np.count_nonzero(finite))
+    if num_non_finite == num_points:
+        raise NonFiniteError(f"{what}: all {num_points} points have a NaN or infinite coordinate")
+    if num_non_finite:
+        raw = raw.take(finite) if raw.faces is None else meshes.without_vertices(raw, finite)
+    largest = max(float(raw.points.max()), -float(raw.points.min()))
+    if largest > MAX_COORDINATE:
+        row = int(np.argmax(np.abs(raw.points).max(axis=1) > MAX_COORDINATE))
+        raise InputError(
+            f"{what}: finite point {row} is at {raw.points[row].tolist()}, beyond the limit of "
+            f"{MAX_COORDINATE:g}; remove such points (they often stand for missing measurements) or use a "
+            "larger unit"
+        )
+    return raw, num_non_finite
+
+
+def _unit(normals: FloatArray) -> FloatArray | None:
+    """Normals of length 1, or None if one has no direction."""
+    lengths = np.linalg.norm(normals, axis=1)
+    if not (np.isfinite(lengths).all() and (lengths > 1e-12).all()):
+        return None
+    unit: FloatArray = normals / lengths[:, None]
+    return unit

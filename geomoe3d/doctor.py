@@ -8,6 +8,7 @@ seconds, nearly all of them the imports of torch and Open3D.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -251,7 +252,12 @@ def _mend_open3d(machine: Machine, complaint: str, installed: str) -> str:
         named = [library for library in SYSTEM_LIBRARIES if library.soname in complaint]
         if lacking or named:
             return _install_system(machine, lacking or named)
-        return f"install the system package that holds {complaint.rsplit(': ', 2)[-2]}"
+        match = re.search(r"[^\s:(]+\.so[.\d]*", complaint)
+        library = match[0] if match else "it"
+        finder = (
+            f"dnf provides '*/{library}'" if machine.family() == "fedora" else f"apt-file search {library}"
+        )
+        return f"install the system package that holds {library}; to find its name: {finder}"
     return _pip(machine, f"install --force-reinstall {installed}")
 
 

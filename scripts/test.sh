@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Sets up what the tests need, then checks style and types and runs the tests. Arguments go to pytest.
+set -euo pipefail
+# shellcheck source=scripts/environment.sh
+source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
+
+# The page is tried in a real browser. Ubuntu's package of it is a snap, which not every machine can run.
+install_browser() {
+  local name
+  for name in chromium chromium-browser google-chrome; do
+    if command -v "$name" >/dev/null; then return; fi
+  done
+  if command -v apt-get >/dev/null && grep -qs '^ID=debian' /etc/os-release; then
+    install_packages chromium
+  else
+    say "no Chromium here: the browser test of the page will be skipped"
+  fi
+}
+
+set_up
+install_package dev,las,e57
+install_browser
+
+cd "$checkout"
+say "ruff"
+"$python" -m ruff check .
+"$python" -m ruff format --check .
+say "mypy"
+"$python" -m mypy
+say "pytest"
+exec "$python" -m pytest "$@"

@@ -1,0 +1,165 @@
+"""What the network is trained for: right labels, a right motion, and experts that share the work.
+
+Every term is computed per layer and summed over the layers, as in the paper. All work on padded batches,
+in float32 outside autocast, and all gradients are finite for degenerate pairs (no inlier, no positive
+weight, collinear points). Cost: linear in N.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from pydantic import Field
+from torch import Tensor
+
+from geomoe3d.config import Section
+from geomoe3d.filters.geomoe import GeoMoEOutput, weights_from_logits
+from geomoe3d.geometry.kabsch import weighted_kabsch
+
+_MIN_POSITIVE = 3
+
+
+class LossConfig(Section):
+    """Weights and forms of the three terms."""
+
+    regression_weight: float = Field(0.5, ge=0, description="of the geometric term after the warm-up")
+    regression_warmup: float = Field(0.04, ge=0, le=1, description="share of the schedule without it")
+    regression_form: Literal["clamp", "geman_mcclure"] = Field(
+        "clamp", description="min(d^2, margin) as published, or margin d^2 / (margin + d^2), never flat"
+    )
+    regression_margin: float = Field(
+        1.0, gt=0, description="squared network units (1 unit: 20 voxels), 1 m^2 at 5 cm voxels"
+    )
+    virtual_points: int = Field(4, ge=2, description="per edge of the lattice in the source's box")
+    balance_weight: float = Field(0.01, ge=0)
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The terms of one batch; ``total`` is what is minimised.
+
+    Attributes:
+        total: scalar.
+        classification: scalar, summed over layers.
+        regression: scalar, summed over layers, before its weight.
+        balance: scalar, mean over layers.
+        num_unsolved: layer-pairs left out of the regression because their weights fix no motion.
+    """
+
+    total: Tensor
+    classification: Tensor
+    regression: Tensor
+    balance: Tensor
+    num_unsolved: Tensor
+
+
+def classification_loss(logits: Tensor, labels: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Balanced binary cross-entropy per pair, half for its inliers and half for its outliers.
+
+    Args:
+        logits: (..., B, N).
+        labels: (B, N) bool, True for inliers.
+        mask: (B, N) bool, False at padding, or None.
+
+    Returns:
+        (...) mean over pairs. A side without members contributes 0.
+
+    Source:
+        0.5 mean_pos softplus(-z) + 0.5 mean_neg softplus(z).
+    """
+    logits = logits.float()
+    positive = labels if mask is None else labels & mask
+    negative = ~labels if mask is None else ~labels & mask
+    halves = []
+    for side, sign in ((positive, -1.0), (negative, 1.0)):
+        cost = F.softplus(sign * logits).masked_fill(~side, 0.0).sum(-1)
+        halves.append(0.5 * cost / side.sum(-1).clamp(min=1))
+    return (halves[0] + halves[1]).mean(-1)
+
+
+def regression_loss(
+    logits: Tensor, coordinates: Tensor, truth: Tensor, virtual: Tensor, config: LossConfig
+) -> tuple[Tensor, Tensor]:
+    """How far the weighted Kabsch motion carries virtual points from where the true motion does.
+
+    Args:
+        logits: (L, B, N), 0 or less at padding.
+        coordinates: (B, N, 6) in network coordinates.
+        truth: (B, 4, 4) true motion in network coordinates.
+        virtual: (B, V, 3) points in the source frame; outlier targets are never touched.
+        config: form and margin.
+
+    Returns:
+        (L,) mean over pairs, where a pair whose weights fix no motion counts 0; and how many those were.
+    """
+    weights = weights_from_logits(logits.float())
+    points = coordinates.float()
+    fit = weighted_kabsch(points[..., :3].expand(len(weights), -1, -1, -1), points[..., 3:], weights)
+    solved = fit.valid & ((weights > 0).sum(-1) >= _MIN_POSITIVE)
+    # Differences of the motions, so that nothing cancels.
+    D = fit.T_target_source - truth.float()
+    offset = virtual.float() @ D[..., :3, :3].transpose(-1, -2) + D[..., None, :3, 3]
+    square = offset.square().sum(-1)
+    margin = config.regression_margin
+    if config.regression_form == "clamp":
+        cost = square.clamp(max=margin)
+    else:
+        cost = margin * square / (margin + square)
+    return cost.mean(-1).masked_fill(~solved, 0.0).mean(-1), (~solved).sum()
+
+
+def virtual_lattice(coordinates: Tensor, mask: Tensor | None, per_edge: int) -> Tensor:
+    """(B, per_edge^3, 3) points evenly in the bounding box of each pair's source half."""
+    source = coordinates[..., :3].float()
+    if mask is None:
+        low, high = source.amin(1), source.amax(1)
+    else:
+        low = source.masked_fill(~mask[..., None], torch.inf).amin(1)
+        high = source.masked_fill(~mask[..., None], -torch.inf).amax(1)
+    steps = torch.linspace(0, 1, per_edge, device=source.device)
+    grid = torch.cartesian_prod(steps, steps, steps)
+    return low[:, None] + grid * (high - low)[:, None]
+
+
+def network_motion(
+    correspondences: Tensor, T_target_source: Tensor, voxel_size: float, unit_voxels: float
+) -> Tensor:
+    """A motion between cloud frames as a motion between the network's centred, scaled frames.
+
+    Args:
+        correspondences: (N, 6) float64, whose halves' means are the frames' origins.
+        T_target_source: (4, 4) float64.
+        voxel_size: cloud units.
+        unit_voxels: voxels in one network unit.
+
+    Returns:
+        (4, 4) float64.
+    """
+    T = T_target_source.clone().double()
+    mean = correspondences.double().mean(dim=0)
+    T[:3, 3] = (T[:3, :3] @ mean[:3] + T[:3, 3] - mean[3:]) / (voxel_size * unit_voxels)
+    return T
+
+
+def total_loss(
+    output: GeoMoEOutput,
+    coordinates: Tensor,
+    labels: Tensor,
+    truth: Tensor,
+    mask: Tensor | None,
+    config: LossConfig,
+    progress: float,
+) -> Losses:
+    """All terms at ``progress`` (0 to 1) of the schedule; before the warm-up ends no motion is solved."""
+    classification = classification_loss(output.logits, labels, mask).sum()
+    regression = classification.new_zeros(())
+    unsolved = torch.zeros((), dtype=torch.int64, device=classification.device)
+    if config.regression_weight > 0 and progress >= config.regression_warmup:
+        virtual = virtual_lattice(coordinates, mask, config.virtual_points)
+        per_layer, unsolved = regression_loss(output.logits, coordinates, truth, virtual, config)
+        regression = per_layer.sum()
+    total = classification + config.regression_weight * regression + config.balance_weight * output.balance
+    return Losses(total, classification, regression, output.balance, unsolved)

@@ -40,8 +40,8 @@ class _Outputs:
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
 @click.option("--output", metavar="FILE", help="Write the transform: .txt, .npy, or .json (whole result).")
 @click.option("--aligned", metavar="FILE", help="Write SOURCE at full resolution, moved into TARGET.")
-@click.option("--picture", metavar="FILE.png", help="Write a picture of before, matches and after.")
-@click.option("--page", metavar="FILE.html", help="Write a page to turn the clouds in, for any browser.")
+@click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
+@click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
 @click.option("--force", is_flag=True, help="Replace output files that exist.")
 @click.option("--quiet", is_flag=True, help="No progress; print the four rows of the matrix alone.")
@@ -129,15 +129,16 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
 
 def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> None:
     """Every output path is refused before the work begins, if it has to be refused at all."""
-    from geomoe3d.clouds.io import SAVE_SUFFIXES
+    from geomoe3d.clouds.io import WRITABLE_MESH_SUFFIXES, WRITABLE_SUFFIXES
     from geomoe3d.errors import OutputError
     from geomoe3d.files import check_output
     from geomoe3d.transform_files import TRANSFORM_SUFFIXES, check_suffix
+    from geomoe3d.visual.picture import FORMATS
 
     wanted = (
         ("--output", outputs.transform, TRANSFORM_SUFFIXES),
-        ("--aligned", outputs.aligned, SAVE_SUFFIXES),
-        ("--picture", outputs.picture, (".png",)),
+        ("--aligned", outputs.aligned, (*WRITABLE_SUFFIXES, *WRITABLE_MESH_SUFFIXES)),
+        ("--picture", outputs.picture, FORMATS),
         ("--page", outputs.page, (".html", ".htm")),
     )
     taken = {Path(path).resolve(): "an input" for path in inputs}

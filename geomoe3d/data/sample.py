@@ -83,8 +83,8 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
     for path in (paths.source, paths.target, paths.truth):
         check_output(path, force=force)
     source, target, T_target_source = make_sample_pair(seed)
-    save_points(paths.source, source, force=force)
-    save_points(paths.target, target, force=force)
+    for path, cloud in ((paths.source, source), (paths.target, target)):
+        save_points(path, cloud.points, colors=cloud.colors, force=force)
     save_transform(
         paths.truth,
         T_target_source,

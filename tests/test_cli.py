@@ -471,7 +471,6 @@ def program(*arguments, **options):
         timeout=300,
         check=False,
         env=headless | {"PYTHONPATH": str(ROOT)},
-        | {"PYTHONPATH": str(ROOT)},
         **options,
     )
 

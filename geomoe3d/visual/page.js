@@ -225,9 +225,11 @@ window.addEventListener("unhandledrejection", (event) => report(event.reason));
         return;
       }
     }
+    // What was drawn, for tests and for whoever scripts the page.
     document.body.dataset.drawnPoints = String(num);
     document.body.dataset.drawnLines = String(state.classes.reduce((sum, on, i) => sum + (on ? lines.ranges[i][1] : 0), 0));
     document.body.dataset.model = Array.from(model, (v) => v.toPrecision(12)).join(" ");
+    document.body.dataset.camera = [state.yaw, state.pitch, state.distance, ...state.center].map((v) => v.toPrecision(6)).join(" ");
     document.body.dataset.ready = "true";
   }
 

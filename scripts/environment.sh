@@ -43,8 +43,8 @@ choose_python() {
     if base=$(command -v "$candidate") && is_suitable "$base"; then return; fi
   done
   install_packages python3 python3-venv
-  base=$(command -v python3) && is_suitable "$base" ||
-    fail "no Python 3.10 or newer here; name one: PYTHON=/path/to/python3 bash scripts/quickstart.sh"
+  base=$(command -v python3)
+  is_suitable "$base" || fail "python3 is older than 3.10; name a newer one with the variable PYTHON"
 }
 
 make_venv() {
@@ -106,5 +106,5 @@ set_up() {
   make_venv
   install_system_libraries
   install_torch
-  install_package
+  install_package ""
 }

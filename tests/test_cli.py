@@ -389,6 +389,15 @@ def test_a_disk_that_refuses_ends_with_2(scans, fake, capsys):
     assert "/proc/T.txt" in capsys.readouterr().err
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a screen")
+def test_show_without_a_screen_is_refused_before_the_work_begins(scans, fake, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert call("register", *scans, "--show") == 2
+    assert "no display" in capsys.readouterr().err
+    assert fake.asked == []
+
+
 def test_an_input_is_never_an_output_nor_two_outputs_one_file(tmp_path, scans, fake, capsys):
     before = Path(scans[0]).read_bytes()
     assert call("register", *scans, "--aligned", scans[0], "--force") == 2

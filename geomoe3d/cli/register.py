@@ -85,6 +85,10 @@ def command(
     config = load_config(config_file, [*assignments, *given])
     outputs = _Outputs(output, aligned, picture, page)
     _check_outputs(outputs, (source, target), force)
+    if show:
+        from geomoe3d.visual.window import check_display
+
+        check_display()
 
     from geomoe3d.cli.terminal import stage_display, stdout_to_stderr
 

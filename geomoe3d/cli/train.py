@@ -1,0 +1,106 @@
+"""``geomoe3d train``: train a network, or go on where a run was interrupted."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from geomoe3d.cli.errors import HELP, INTERRUPTED, NOT_SURE, traceback_option
+
+if TYPE_CHECKING:
+    from geomoe3d.training.config import TrainConfig
+
+
+@click.command(context_settings=HELP)
+@click.argument("config", type=click.Path())
+@click.argument("assignments", nargs=-1, metavar="[KEY=VALUE]...")
+@click.option("--out", type=click.Path(), help="Run folder (default: runs/ and the name of CONFIG).")
+@click.option("--fresh", is_flag=True, help="Refuse to go on with a run that is there.")
+@click.option("--overfit", is_flag=True, help="Only learn one batch by heart; writes nothing.")
+@click.option("--show", is_flag=True, help="Print the complete configuration and stop.")
+@click.option("--quiet", is_flag=True, help="Print nothing but the summary.")
+@traceback_option
+@click.pass_context
+def command(
+    context: click.Context,
+    config: str,
+    assignments: tuple[str, ...],
+    out: str | None,
+    fresh: bool,
+    overfit: bool,
+    show: bool,
+    quiet: bool,
+) -> None:
+    """Train the network that CONFIG (a YAML file, see configs/train) describes.
+
+    KEY=VALUE changes a setting, e.g. steps=2000 network.num_layers=4 data.train=SHARDS. Started again with
+    the same folder, a run goes on from its last checkpoint, exactly. Under torchrun it uses every process.
+    The folder gets logs (CSV, TensorBoard), checkpoints, weights.safetensors with its card, curves.png.
+    """
+    from geomoe3d.training.config import load_train_config
+
+    settings = load_train_config(config, list(assignments))
+    if show:
+        import yaml
+
+        click.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), nl=False)
+    elif overfit:
+        context.exit(_overfit(settings, quiet))
+    else:
+        context.exit(_train(settings, Path(out) if out else Path("runs") / Path(config).stem, fresh, quiet))
+
+
+def _train(settings: TrainConfig, folder: Path, fresh: bool, quiet: bool) -> int:
+    from geomoe3d.cli.train_display import Display
+    from geomoe3d.training.distributed import leave
+    from geomoe3d.training.trainer import TrainingRun
+
+    try:
+        run = TrainingRun(settings, folder, fresh=fresh)
+        if run.process.world == 1:
+            _stop_gently(run)
+        with Display(quiet or not run.process.is_first) as display:
+            summary = run.train(display)
+    finally:
+        leave()
+    if not run.process.is_first:
+        return 0
+    if not summary.finished:
+        click.echo(f"stopped at step {summary.step}; the same command goes on from there", err=True)
+        return INTERRUPTED
+    best = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in summary.best.items())
+    click.echo(f"{summary.step} steps, {summary.pairs_per_s:.1f} pairs/s, {summary.skipped} skipped")
+    click.echo(f"best at step {summary.best_step}: {best}")
+    click.echo(f"weights: {summary.weights}\ncurves:  {folder / 'curves.png'}")
+    return 0
+
+
+def _overfit(settings: TrainConfig, quiet: bool) -> int:
+    from geomoe3d.training.overfit import TARGET_F1, overfit_one_batch
+
+    def report(step: int, measures: dict[str, float]) -> None:
+        if not quiet and step % 10 == 0:
+            click.echo(f"step {step:4d}  loss {measures['loss']:.4f}  F1 {measures['f1']:.4f}", err=True)
+
+    steps, f1 = overfit_one_batch(settings, report=report)
+    reached = f1 > TARGET_F1
+    click.echo(f"F1 {f1:.4f} after {steps} steps on one batch of {settings.batch_size} pairs", err=False)
+    if not reached:
+        click.echo(f"did not reach {TARGET_F1}: network, losses or data are at fault", err=True)
+    return 0 if reached else NOT_SURE
+
+
+def _stop_gently(run: Any) -> None:
+    """The first interrupt ends the run after its step, with a checkpoint; the second one at once."""
+
+    def stop(number: int, frame: object) -> None:
+        if run.stop:
+            sys.exit(INTERRUPTED)
+        run.stop = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)

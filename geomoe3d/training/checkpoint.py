@@ -1,0 +1,102 @@
+"""Checkpoints of a run: written whole or not at all, read without unpickling code.
+
+``last.pt`` holds all that the next step depends on; ``best.pt`` the weights of the best validation. Each
+says with which configuration, data and source revision it was made.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from geomoe3d import __version__
+from geomoe3d.errors import CheckpointError
+from geomoe3d.files import write_atomically
+from geomoe3d.training.config import FREE_KEYS, TrainConfig
+
+_FORMAT = "geomoe3d-checkpoint"
+_VERSION = 1
+
+
+def save_checkpoint(path: Path, state: dict[str, Any], config: TrainConfig, data: str) -> None:
+    """Replace ``path`` by ``state`` plus what identifies it; on disk before this returns."""
+    complete = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "config": config.model_dump_json(),
+        "data": data,
+        "commit": source_commit(),
+        **state,
+    }
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            torch.save(complete, file)
+            file.flush()
+            os.fsync(file.fileno())
+
+    write_atomically(path, write, force=True)
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """The state of ``path``, tensors on the CPU.
+
+    Raises:
+        CheckpointError: unreadable, truncated, or not one of ours.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise CheckpointError(f"no checkpoint '{path}'") from None
+    except Exception as error:  # torch names no common class for what a damaged file raises
+        raise CheckpointError(f"checkpoint '{path}' cannot be read: {error}") from None
+    if not isinstance(state, dict) or state.get("format") != _FORMAT or state.get("version") != _VERSION:
+        raise CheckpointError(f"'{path}' is no checkpoint of this version of geomoe3d")
+    return state
+
+
+def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: Path) -> None:
+    """Refuse to go on with another configuration or other data than the run began with.
+
+    Raises:
+        CheckpointError: names what differs.
+    """
+    before = TrainConfig.model_validate_json(state["config"])
+    changed = [key for key in _differences(before.model_dump(), config.model_dump()) if not _is_free(key)]
+    if changed:
+        raise CheckpointError(
+            f"'{path}' was made with other settings ({', '.join(changed)}); set them back, or train into "
+            f"another folder (start from these weights with init_from)"
+        )
+    if state["data"] != data:
+        raise CheckpointError(f"'{path}' was trained on other data: {state['data']}, now {data}")
+
+
+def source_commit() -> str:
+    """Revision of the source that runs, or the version of an installed package."""
+    try:
+        root = Path(__file__).resolve().parents[2]
+        if not (root / ".git").exists():
+            return f"geomoe3d {__version__}"
+        command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return f"geomoe3d {__version__}"
+
+
+def _differences(a: dict[str, Any], b: dict[str, Any], prefix: str = "") -> list[str]:
+    keys: list[str] = []
+    for name in a:
+        if isinstance(a[name], dict) and isinstance(b[name], dict):
+            keys += _differences(a[name], b[name], f"{prefix}{name}.")
+        elif a[name] != b[name]:
+            keys.append(prefix + name)
+    return keys
+
+
+def _is_free(key: str) -> bool:
+    return any(key == free or key.startswith(free + ".") for free in FREE_KEYS)

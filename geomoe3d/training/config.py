@@ -1,0 +1,95 @@
+"""Everything that decides a training run, typed; configs/train/*.yaml hold the same tree.
+
+Durations are given in steps (one update of the weights) or as shares of the schedule, so that a shorter
+run is the same run in small.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from geomoe3d.config import Section, build_config, read_yaml, set_keys
+from geomoe3d.filters.architecture import NetworkConfig
+from geomoe3d.training.augment import AugmentationConfig
+from geomoe3d.training.losses import LossConfig
+from geomoe3d.training.synthetic import SyntheticConfig
+
+# Keys that change neither the weights nor their order of updates: free to differ when a run goes on.
+FREE_KEYS = ("logging", "validation", "checkpoint_every", "workers", "data.prefetch", "device")
+
+
+class DataConfig(Section):
+    """Where pairs come from."""
+
+    train: str = Field("synthetic", description="synthetic, or a folder of shards")
+    validation: str = Field("synthetic", description="synthetic (other rooms), or a folder of shards")
+    correspondences: int | None = Field(1000, ge=3, description="most per training pair; None: all")
+    prefetch: int = Field(4, ge=1, description="batches that each worker prepares ahead")
+    synthetic: SyntheticConfig = SyntheticConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
+
+
+class OptimizerConfig(Section):
+    """Adam and its schedule."""
+
+    learning_rate: float = Field(1e-4, gt=0, description="the largest of the schedule")
+    schedule: Literal["exponential", "cosine", "one_cycle", "constant"] = "exponential"
+    warmup: float = Field(0.0, ge=0, lt=1, description="share of the schedule with a rising rate")
+    decay_start: float = Field(0.16, ge=0, le=1, description="share after which exponential decay sets in")
+    final_ratio: float = Field(0.186, gt=0, le=1, description="last learning rate over the largest")
+    weight_decay: float = Field(0.0, ge=0, description="decoupled (AdamW)")
+    max_gradient_norm: float | None = Field(None, gt=0, description="None: no clipping, as published")
+    ema_decay: float = Field(
+        0.0, ge=0, lt=1, description="averaged weights are validated and shipped; 0: none"
+    )
+
+
+class ValidationConfig(Section):
+    """When and on how many pairs a run is judged."""
+
+    every: int = Field(500, ge=1, description="steps")
+    num_pairs: int = Field(64, ge=1)
+    best_metric: Literal["recall", "f1"] = Field("recall", description="what `best` is chosen by")
+
+
+class LoggingConfig(Section):
+    """What a run writes."""
+
+    every: int = Field(10, ge=1, description="steps per row of the CSV and per TensorBoard point")
+    tensorboard: bool = True
+
+
+class TrainConfig(Section):
+    """One training run."""
+
+    seed: int = Field(0, ge=0)
+    steps: int = Field(500_000, ge=1)
+    batch_size: int = Field(32, ge=1, description="pairs per process and micro-batch")
+    accumulation: int = Field(1, ge=1, description="micro-batches per step")
+    device: str = Field("auto", description="auto, cpu, cuda, cuda:1")
+    precision: Literal["float32", "bf16"] = "float32"
+    checkpoint_activations: bool = Field(
+        False, description="recompute layers in the backward pass: less memory"
+    )
+    workers: int = Field(0, ge=0, description="processes that prepare batches")
+    checkpoint_every: int = Field(250, ge=1, description="steps")
+    init_from: str | None = Field(None, description="weights to start from (safetensors)")
+    max_skipped_in_row: int = Field(50, ge=1, description="non-finite steps in a row that end the run")
+    network: NetworkConfig = NetworkConfig()
+    data: DataConfig = DataConfig()
+    loss: LossConfig = LossConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    validation: ValidationConfig = ValidationConfig()
+    logging: LoggingConfig = LoggingConfig()
+
+
+def load_train_config(path: str | None = None, assignments: list[str] | None = None) -> TrainConfig:
+    """The run of a YAML file (None: defaults) with ``key=value`` changes.
+
+    Raises:
+        ConfigError: unreadable file, unknown key (names the nearest), value out of range.
+    """
+    tree = read_yaml(path) if path is not None else {}
+    return build_config(TrainConfig, set_keys(tree, assignments or []), str(path or "training configuration"))

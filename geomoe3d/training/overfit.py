@@ -1,0 +1,49 @@
+"""Learning one batch by heart: if a network and its losses cannot do that, nothing else will work."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import torch
+
+from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.training.batches import TrainingSamples, make_batch, open_training
+from geomoe3d.training.config import TrainConfig
+from geomoe3d.training.distributed import Process, choose_device
+from geomoe3d.training.step import Updater
+
+TARGET_F1 = 0.99
+LEARNING_RATE = 1e-3
+
+
+def overfit_one_batch(
+    config: TrainConfig, max_steps: int = 400, report: Callable[[int, dict[str, float]], None] | None = None
+) -> tuple[int, float]:
+    """Train on the run's first batch alone until its F1 exceeds 0.99.
+
+    Args:
+        config: network, losses and data of a run; the learning rate is 1e-3, the schedule level, and the
+            geometric term is on from the start.
+        max_steps: give up after so many.
+        report: called with step and measures after each.
+
+    Returns:
+        Steps taken and the last F1 on the batch (in training mode), also if the target was not reached.
+    """
+    device = choose_device(config.device, Process())
+    torch.manual_seed(config.seed)
+    samples = TrainingSamples(open_training(config), config)
+    batch = make_batch([samples[i] for i in range(config.batch_size)])
+    model = GeoMoE(config.network).to(device).train()
+    optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.0)
+    updater = Updater(model, model, optimizer, config.model_copy(update={"accumulation": 1}))
+    f1 = 0.0
+    for step in range(1, max_steps + 1):
+        _, measures = updater.step(itertools.repeat(batch), 1.0, LEARNING_RATE, device)
+        f1 = measures["f1"]
+        if report is not None:
+            report(step, measures)
+        if f1 > TARGET_F1:
+            return step, f1
+    return max_steps, f1

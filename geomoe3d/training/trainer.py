@@ -1,0 +1,366 @@
+"""A training run: one folder, one configuration, exact to the bit when interrupted and resumed on a CPU.
+
+    run = TrainingRun(config, "runs/faithful")
+    summary = run.train(reporter)
+
+The folder holds config.yaml, train.csv, experts.csv, validation.csv, TensorBoard events, last.pt, best.pt
+and, at the end, weights.safetensors with its card and curves.png. Started again in the same folder it goes
+on from last.pt. Under torchrun every process runs this; the first one writes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch.nn.parallel import DistributedDataParallel
+
+from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
+from geomoe3d.files import write_atomically
+from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples
+from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint, source_commit
+from geomoe3d.training.config import TrainConfig
+from geomoe3d.training.distributed import Process, choose_device, join
+from geomoe3d.training.logs import CsvLog, TensorBoardLog, draw_curves
+from geomoe3d.training.measures import evaluate
+from geomoe3d.training.schedule import learning_rate
+from geomoe3d.training.step import AveragedWeights, Updater
+
+_TRAIN_COLUMNS = [
+    "loss", "classification", "regression", "balance", "precision", "recall", "f1", "kept_fraction",
+    "router_entropy", "unsolved", "gradient_norm", "learning_rate", "skipped", "pairs_per_s",
+]  # fmt: skip
+_VALIDATION_COLUMNS = ["precision", "recall", "f1", "registration_recall", "best"]
+
+
+class Reporter(Protocol):
+    """Where a run says what it does; the command line draws it live."""
+
+    def started(self, config: TrainConfig, first_step: int, notes: list[str]) -> None:
+        """Before the first step."""
+
+    def stepped(self, step: int, measures: dict[str, float], pairs_per_s: float, skipped: int) -> None:
+        """After every step."""
+
+    def validated(self, step: int, measures: dict[str, float], best: bool) -> None:
+        """After a validation."""
+
+
+@dataclass
+class Summary:
+    """How a run ended.
+
+    Attributes:
+        step: steps done.
+        skipped: steps whose gradient was not finite.
+        best_step: step of the best validation, 0 if there was none.
+        best: its measures.
+        finished: False if it was asked to stop.
+        weights: what was exported, or None if unfinished.
+        pairs_per_s: training throughput of this process group.
+    """
+
+    step: int
+    skipped: int
+    best_step: int
+    best: dict[str, float]
+    finished: bool
+    weights: Path | None
+    pairs_per_s: float
+
+
+@dataclass
+class _Progress:
+    """All that a checkpoint holds besides tensors."""
+
+    step: int = 0
+    skipped: int = 0
+    skipped_in_row: int = 0
+    best_step: int = 0
+    best: dict[str, float] = field(default_factory=dict)
+    meters: dict[str, list[float]] = field(default_factory=dict)
+
+
+class TrainingRun:
+    """One run in one folder.
+
+    Args:
+        config: everything that decides it.
+        folder: created if missing; with a ``last.pt`` in it the run goes on from there.
+        fresh: refuse to go on: the folder must hold no run.
+
+    Raises:
+        CheckpointError: the folder's run has other settings or data, or is damaged.
+        OutputError: the folder cannot be used, or holds a run and ``fresh`` is set.
+    """
+
+    def __init__(self, config: TrainConfig, folder: str | Path, *, fresh: bool = False) -> None:
+        self.config = config
+        self.folder = Path(folder)
+        self.process: Process = join()
+        self.device = choose_device(config.device, self.process)
+        self.stop = False
+        self.notes: list[str] = []
+        self._open_folder(fresh)
+        self.pairs = open_training(config)
+        torch.manual_seed(config.seed)
+        self.model = GeoMoE(config.network)
+        if config.init_from is not None:
+            self._start_from(config.init_from)
+        self.model.checkpoint_activations = config.checkpoint_activations
+        self.model.to(self.device).train()
+        self.averaged = (
+            AveragedWeights(self.model, config.optimizer.ema_decay) if config.optimizer.ema_decay else None
+        )
+        self.optimizer = torch.optim.AdamW(
+            self.model.parameters(),
+            lr=config.optimizer.learning_rate,
+            weight_decay=config.optimizer.weight_decay,
+        )
+        self.progress = _Progress()
+        if self.last_path.exists():
+            self._resume()
+        elif self.process.is_first:
+            text = _yaml(config)
+            write_atomically(self.folder / "config.yaml", lambda p: _write_text(p, text), force=True)
+        self.process.wait()
+
+    @property
+    def last_path(self) -> Path:
+        """Checkpoint that a restart goes on from."""
+        return self.folder / "last.pt"
+
+    @property
+    def best_path(self) -> Path:
+        """Weights of the best validation."""
+        return self.folder / "best.pt"
+
+    def train(self, reporter: Reporter, until: int | None = None) -> Summary:
+        """Train to the end of the schedule, to step ``until``, or until ``stop`` is set.
+
+        Raises:
+            GeoMoE3DError: too many steps in a row had no finite gradient.
+        """
+        config, progress = self.config, self.progress
+        last_step = config.steps if until is None else min(until, config.steps)
+        wrapped: torch.nn.Module = self.model
+        if self.process.world > 1:
+            wrapped = DistributedDataParallel(self.model)
+        updater = Updater(self.model, wrapped, self.optimizer, config)
+        loader = training_loader(config, self.pairs, progress.step, self.process.rank, self.process.world)
+        batches: Iterator[Batch] = iter(loader)
+        logs = _Logs(self.folder, config, progress.step) if self.process.is_first else None
+        if logs is not None and logs.board.missing:
+            self.notes.append("TensorBoard is not installed (pip install tensorboard): CSV logs only")
+        if self.process.is_first:
+            reporter.started(config, progress.step, self.notes)
+        samples = validation_samples(config) if self.process.is_first else []
+        pairs_per_step = config.batch_size * config.accumulation * self.process.world
+        rate = _Rate(pairs_per_step)
+        while progress.step < last_step and not self.stop:
+            along = progress.step / config.steps
+            lr = learning_rate(config.optimizer, along)
+            updated, measures = updater.step(batches, along, lr, self.device)
+            progress.step += 1
+            self._count(updated)
+            if updated and self.averaged is not None:
+                self.averaged.update(self.model)
+            rate.tick()
+            for name, value in measures.items():
+                total = progress.meters.setdefault(name, [0.0, 0.0])
+                total[0] += value
+                total[1] += 1
+            done = progress.step >= config.steps
+            if self.process.is_first:
+                reporter.stepped(progress.step, measures, rate.value, progress.skipped)
+            if progress.step % config.logging.every == 0 or done:
+                means = {name: total / count for name, (total, count) in progress.meters.items()}
+                progress.meters = {}
+                if logs is not None:
+                    extra = {"learning_rate": lr, "skipped": progress.skipped, "pairs_per_s": rate.value}
+                    logs.training(progress.step, means | extra)
+            if progress.step % config.validation.every == 0 or done:
+                if logs is not None:
+                    self._validate(samples, logs, reporter)
+                    rate.pause()
+                self.process.wait()
+            if progress.step % config.checkpoint_every == 0 or done:
+                self._save()
+        finished = progress.step >= config.steps
+        if not finished:
+            self._save()
+        if logs is not None:
+            logs.board.close()
+        weights = self._finish() if finished and self.process.is_first else None
+        return Summary(
+            progress.step,
+            progress.skipped,
+            progress.best_step,
+            dict(progress.best),
+            finished,
+            weights,
+            rate.value,
+        )
+
+    @property
+    def shipped(self) -> GeoMoE:
+        """The network that is validated and exported: averaged weights if they are kept."""
+        return self.model if self.averaged is None else self.averaged.model
+
+    def _count(self, updated: bool) -> None:
+        progress = self.progress
+        progress.skipped_in_row = 0 if updated else progress.skipped_in_row + 1
+        progress.skipped += not updated
+        if progress.skipped_in_row >= self.config.max_skipped_in_row:
+            raise GeoMoE3DError(
+                f"{progress.skipped_in_row} steps in a row had no finite gradient (step {progress.step}); "
+                f"lower optimizer.learning_rate, or train in float32; last.pt holds the run before"
+            )
+
+    def _validate(self, samples: list[Any], logs: _Logs, reporter: Reporter) -> None:
+        progress, config = self.progress, self.config
+        measures = evaluate(self.shipped, samples, self.device)
+        key = "registration_recall" if config.validation.best_metric == "recall" else "f1"
+        # Ties in a small validation set are common; F1 decides between equal recalls.
+        rank = (measures[key], measures["f1"])
+        best = not progress.best or rank > (progress.best[key], progress.best["f1"])
+        if best:
+            progress.best, progress.best_step = measures, progress.step
+            state = {"step": progress.step, "model": self.shipped.state_dict(), "metrics": measures}
+            save_checkpoint(self.best_path, state, config, self.pairs.identity())
+        logs.validation(progress.step, measures | {"best": int(best)})
+        reporter.validated(progress.step, measures, best)
+
+    def _save(self) -> None:
+        if self.process.is_first:
+            progress = self.progress
+            state = {
+                "step": progress.step,
+                "skipped": progress.skipped,
+                "skipped_in_row": progress.skipped_in_row,
+                "best_step": progress.best_step,
+                "best": progress.best,
+                "meters": progress.meters,
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "averaged": None if self.averaged is None else self.averaged.state(),
+                "random_state": torch.get_rng_state(),
+            }
+            save_checkpoint(self.last_path, state, self.config, self.pairs.identity())
+        self.process.wait()
+
+    def _resume(self) -> None:
+        state = load_checkpoint(self.last_path)
+        check_same_run(state, self.config, self.pairs.identity(), self.last_path)
+        self.model.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        if self.averaged is not None:
+            self.averaged.restore(state["averaged"])
+        torch.set_rng_state(state["random_state"])
+        names = ("step", "skipped", "skipped_in_row", "best_step", "best", "meters")
+        self.progress = _Progress(**{name: state[name] for name in names})
+        self.notes.append(f"goes on from step {self.progress.step} of '{self.last_path}'")
+
+    def _start_from(self, path: str) -> None:
+        model, _ = load_pretrained(path)
+        if model.config != self.config.network:
+            raise CheckpointError(
+                f"'{path}' holds another architecture than the configuration asks for: "
+                f"{model.config.model_dump_json()}"
+            )
+        self.model.load_state_dict(model.state_dict())
+
+    def _finish(self) -> Path:
+        best = load_checkpoint(self.best_path)
+        model = GeoMoE(self.config.network)
+        model.load_state_dict(best["model"])
+        data = self.config.data
+        card = WeightCard(
+            architecture={},
+            voxel_size=data.synthetic.voxel_size if data.train == "synthetic" else None,
+            training_data=self.pairs.identity(),
+            steps=int(best["step"]),
+            metrics=best["metrics"],
+            commit=source_commit(),
+        )
+        path = self.folder / "weights.safetensors"
+        save_pretrained(path, model, card, force=True)
+        draw_curves(self.folder)
+        return path
+
+    def _open_folder(self, fresh: bool) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot use '{self.folder}' as run folder: {error.strerror}") from None
+        if fresh and self.last_path.exists():
+            raise OutputError(f"'{self.folder}' holds a run already; give another folder, or leave --fresh")
+        if not self.last_path.exists() and (self.folder / "weights.safetensors").exists():
+            raise OutputError(f"'{self.folder}' holds weights but no run to go on with; give another folder")
+
+
+class _Logs:
+    """The CSV files and TensorBoard of a run."""
+
+    def __init__(self, folder: Path, config: TrainConfig, first_step: int) -> None:
+        network = config.network
+        experts = []
+        if network.feed_forward == "moe":
+            for layer in range(network.num_layers):
+                for place in (1, 2):
+                    where = f"layer{layer + 1}_moe{place}"
+                    experts += [f"{where}_entropy"]
+                    experts += [f"{where}_expert{i + 1}" for i in range(network.num_experts)]
+        self._experts = experts
+        self._train = CsvLog(folder / "train.csv", _TRAIN_COLUMNS, first_step)
+        self._usage = CsvLog(folder / "experts.csv", experts, first_step) if experts else None
+        self._validation = CsvLog(folder / "validation.csv", _VALIDATION_COLUMNS, first_step)
+        self.board = TensorBoardLog(folder, first_step, config.logging.tensorboard)
+
+    def training(self, step: int, values: dict[str, float]) -> None:
+        kept = {name: values[name] for name in _TRAIN_COLUMNS if name in values}
+        usage = {name: values[name] for name in self._experts if name in values}
+        self._train.add(step, kept)
+        self.board.add(step, "train", kept)
+        if self._usage is not None:
+            self._usage.add(step, usage)
+            self.board.add(step, "experts", usage)
+
+    def validation(self, step: int, values: dict[str, float]) -> None:
+        self._validation.add(step, values)
+        self.board.add(step, "validation", values)
+
+
+class _Rate:
+    """Pairs per second, smoothed over the last steps, pauses left out."""
+
+    def __init__(self, pairs_per_step: int) -> None:
+        self.pairs_per_step = pairs_per_step
+        self.value = 0.0
+        self._last: float | None = time.perf_counter()
+
+    def tick(self) -> None:
+        now = time.perf_counter()
+        if self._last is not None:
+            current = self.pairs_per_step / max(now - self._last, 1e-9)
+            self.value = current if self.value == 0 else 0.9 * self.value + 0.1 * current
+        self._last = now
+
+    def pause(self) -> None:
+        self._last = time.perf_counter()
+
+
+def _yaml(config: TrainConfig) -> str:
+    import yaml
+
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")

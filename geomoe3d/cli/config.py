@@ -9,7 +9,7 @@ import click
 from geomoe3d.cli.errors import HELP, traceback_option
 
 
-@click.command(context_settings=HELP)
+@click.command(context_settings=HELP, short_help="Print the complete configuration, commented.")
 @click.option("--config", "source", metavar="FILE", help="Start from this YAML file.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="Change one value.")
 @click.option("--out", metavar="FILE", help="Write to this file instead of the screen.")

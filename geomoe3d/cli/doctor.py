@@ -11,7 +11,7 @@ from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
 _COLORS = {"ok": "green", "missing": "yellow", "broken": "red"}
 
 
-@click.command(context_settings=HELP)
+@click.command(context_settings=HELP, short_help="Say what this machine lacks, and what mends it.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @traceback_option
 @click.pass_context

@@ -27,7 +27,7 @@ class _Outputs:
     page: str | None
 
 
-@click.command(context_settings=HELP)
+@click.command(context_settings=HELP, short_help="Lay one scan on another, and say how sure.")
 @click.argument("source", metavar="SOURCE")
 @click.argument("target", metavar="TARGET")
 @click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid, in the clouds' unit. [chosen]")

@@ -21,7 +21,7 @@ S = TypeVar("S", bound="Section")
 class Section(BaseModel):
     """A node of the configuration tree: frozen, strict about keys, lenient about 1 against 1.0."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 
 
 class PreparationConfig(Section):
@@ -32,9 +32,9 @@ class PreparationConfig(Section):
         30_000, ge=100, description="voxel points kept per cloud; beyond it a seeded choice is taken"
     )
     normal_radius: float = Field(2.0, gt=0, description="neighbourhood of a normal, in voxels")
-    normal_neighbors: int = Field(30, ge=3)
+    normal_neighbors: int = Field(30, ge=3, description="at most so many points fit a normal")
     feature_radius: float = Field(5.0, gt=0, description="neighbourhood of FPFH, in voxels")
-    feature_neighbors: int = Field(100, ge=3)
+    feature_neighbors: int = Field(100, ge=3, description="at most so many points make a feature")
     viewpoint: Literal["auto", "origin", "centroid"] = Field(
         "auto",
         description="where the sensor stood: the file's origin, unknown (normals turn to the centroid), or "
@@ -45,7 +45,11 @@ class PreparationConfig(Section):
 class MatchingConfig(Section):
     """Nearest neighbours in feature space."""
 
-    method: Literal["one_way", "mutual", "ratio"] = "one_way"
+    method: Literal["one_way", "mutual", "ratio"] = Field(
+        "one_way",
+        description="keep each source point's nearest target, only where that is mutual, or only where the "
+        "second best is clearly worse",
+    )
     neighbors: int = Field(1, ge=1, le=10, description="targets kept per source point")
     max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by method ratio")
     max_correspondences: int = Field(
@@ -62,25 +66,31 @@ class FilterConfig(Section):
 class EstimatorConfig(Section):
     """From weighted correspondences to candidate motions."""
 
-    name: Literal["consensus", "ransac", "svd"] = "consensus"
+    name: Literal["consensus", "ransac", "svd"] = Field(
+        "consensus",
+        description="consensus: sets that preserve lengths; ransac: random samples; svd: one least squares "
+        "fit, for correspondences that are nearly all right",
+    )
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
     num_hypotheses: int = Field(8, ge=1, description="distinct hypotheses kept")
-    ransac_iterations: int = Field(50_000, ge=1)
-    ransac_confidence: float = Field(0.999, gt=0, lt=1)
+    ransac_iterations: int = Field(50_000, ge=1, description="most samples drawn by ransac")
+    ransac_confidence: float = Field(
+        0.999, gt=0, lt=1, description="ransac stops when this sure that it has drawn a clean sample"
+    )
 
 
 class VerificationConfig(Section):
     """Re-scoring of the hypotheses against the clouds themselves."""
 
-    enabled: bool = True
+    enabled: bool = Field(True, description="without it the correspondences alone choose the answer")
 
 
 class RefinementConfig(Section):
     """Local refinement of the chosen hypothesis on the clouds."""
 
-    method: Literal["none", "icp", "gicp"] = "icp"
+    method: Literal["none", "icp", "gicp"] = Field("icp", description="how the chosen motion is polished")
     max_distance: float = Field(1.0, gt=0, description="largest distance of matched points, in voxels")
-    max_iterations: int = Field(30, ge=1)
+    max_iterations: int = Field(30, ge=1, description="most steps of the refinement")
 
 
 class JudgementConfig(Section):
@@ -96,7 +106,7 @@ class RegistrationConfig(Section):
     """Everything that decides a registration besides the two clouds."""
 
     voxel_size: float | None = Field(None, gt=0, description="cloud units; None chooses and reports one")
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, description="same files, same seed: same answer")
     preparation: PreparationConfig = PreparationConfig()
     matching: MatchingConfig = MatchingConfig()
     filter: FilterConfig = FilterConfig()

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import geomoe3d
-from geomoe3d.config import RegistrationConfig, load_config
+from geomoe3d.config import RegistrationConfig, Section, load_config
 from geomoe3d.config_text import commented_yaml
 from geomoe3d.errors import ConfigError
 
@@ -213,6 +213,18 @@ def test_commented_yaml_names_every_key_with_its_choices_and_limits():
     assert yaml.safe_load(text) == RegistrationConfig().model_dump()
     assert "  # one of consensus, ransac, svd\n  name: consensus\n" in text
     assert re.search(r"# .*above 0\nvoxel_size: null\n", text)
+
+
+def test_every_key_says_what_it_means():
+    def silent(section, prefix=""):
+        for name, info in section.model_fields.items():
+            if isinstance(info.annotation, type) and issubclass(info.annotation, Section):
+                assert info.annotation.__doc__
+                yield from silent(info.annotation, f"{prefix}{name}.")
+            elif not info.description:
+                yield prefix + name
+
+    assert list(silent(RegistrationConfig)) == []
 
 
 def test_an_unknown_key_names_the_nearest(tmp_path):

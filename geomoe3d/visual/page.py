@@ -90,6 +90,8 @@ def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
     motions = {"before": scene.before, "answer": scene.after, "alternative": scene.alternative}
     result = view.result
     limit = 2.0 * result.inlier_threshold
+    if not (np.isfinite(limit) and limit > 0):  # a registration that failed before there was a threshold
+        limit = 0.1 * scene.radius
     distances = {
         name: _base64_bytes(distance_to_target(view, scene, motion, limit) / limit)
         for name, motion in motions.items()
@@ -268,8 +270,8 @@ def _base64_floats(values: FloatArray) -> str:
 
 
 def _base64_bytes(values: NDArray[np.float64]) -> str:
-    """Values in [0, 1] as 0 to 255; larger ones become 255."""
-    levels = np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
+    """Values in [0, 1] as 0 to 255; larger ones become 255, NaN becomes 0."""
+    levels = np.round(255.0 * np.clip(np.nan_to_num(values, posinf=1.0), 0.0, 1.0)).astype(np.uint8)
     return base64.b64encode(np.ascontiguousarray(levels).tobytes()).decode("ascii")
 
 

@@ -316,8 +316,11 @@ def _draw_residuals(axes: Axes, view: RegistrationView) -> None:
         _say(axes, "no transform was found" if len(residuals) else "no correspondences were given")
         return
     threshold = view.result.inlier_threshold
+    largest = float(residuals[finite].max())
+    if not (np.isfinite(threshold) and threshold > 0):
+        threshold = largest or 1.0
     low = threshold / 100.0  # smaller ones join the first bar
-    high = max(float(residuals[finite].max()), threshold) * 1.1
+    high = max(largest, threshold) * 1.1
     bins = np.geomspace(low, high, 45)
     classes = [kind for kind in _classes(view) if (kind[2] & finite).any()]
     axes.hist(

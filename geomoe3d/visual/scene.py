@@ -126,17 +126,16 @@ def thin(points: FloatArray, max_points: int, rng: np.random.Generator) -> IntAr
     """Rows of at most ``max_points`` finite points, spread evenly over the surface rather than over the rows.
 
     A scanner measures near surfaces a thousand times denser than far ones; a plain random choice would show
-    little else. So: a random choice of four times as many, then one point per cell of the finest grid that
+    little else. So: a random choice of eight times as many, then one point per cell of the finest grid that
     leaves few enough. Returns sorted rows; all finite rows where there are few enough.
     """
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(rows) <= max_points:
         return rows
-    rows = (
-        rng.permutation(rows)
-        if len(rows) <= 4 * max_points
-        else rng.choice(rows, 4 * max_points, replace=False)
-    )
+    if len(rows) > 8 * max_points:
+        rows = rng.choice(rows, 8 * max_points, replace=False)
+    else:
+        rows = rng.permutation(rows)
     local = points[rows] - points[rows].min(axis=0)
     bulk = np.percentile(local, 99, axis=0) - np.percentile(local, 1, axis=0)  # strays may be very far away
     low, high = 0.0, float(bulk.max()) or 1.0  # cell edges that leave too many, and few enough

@@ -211,7 +211,7 @@ def test_commented_yaml_reads_back_whatever_the_values(tmp_path):
 def test_commented_yaml_names_every_key_with_its_choices_and_limits():
     text = commented_yaml(RegistrationConfig())
     assert yaml.safe_load(text) == RegistrationConfig().model_dump()
-    assert "; one of consensus, ransac, svd\n  name: consensus\n" in " ".join(text.split("\n  # "))
+    assert re.search(r"one of consensus, ransac, svd\n  name: consensus\n", text)
     assert re.search(r"# .*above 0\nvoxel_size: null\n", text)
 
 

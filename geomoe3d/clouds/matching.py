@@ -1,0 +1,96 @@
+"""Nearest neighbours in feature space, exact, with bounded memory.
+
+Place: match. Blocks of the similarity matrix are formed by matrix products, at most about 100 MB at a
+time; O(n m) time: 5,000 against 5,000 points take some 0.1 s, 30,000 against 30,000 about 4 s.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomoe3d.config import MatchingConfig
+from geomoe3d.errors import InputError
+from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
+
+_BLOCK_ENTRIES = 12_000_000
+
+
+def match(source: PreparedCloud, target: PreparedCloud, config: MatchingConfig) -> Correspondences:
+    """Putative correspondences between two described clouds.
+
+    Methods: ``one_way`` keeps for every source point its nearest targets; ``mutual`` of these only pairs
+    that are each other's nearest; ``ratio`` only pairs whose distance is at most ``max_ratio`` of the
+    second best. At most ``max_correspondences`` are kept: those with the smallest ratio, that is the most
+    distinctive, in source order.
+
+    Raises:
+        InputError: a cloud without features.
+    """
+    if source.features is None or target.features is None:
+        raise InputError("match needs described clouds; call describe(cloud, config) on both first")
+    index, distance, ratio, backward = nearest_features(source.features, target.features, config.neighbors)
+    rows = np.repeat(np.arange(len(source)), index.shape[1])
+    columns = index.ravel()
+    mutual = backward[columns] == rows
+    keep: BoolArray = np.ones(len(rows), dtype=np.bool_)
+    if config.method == "mutual":
+        keep = mutual
+    elif config.method == "ratio":
+        keep = ratio.ravel() <= config.max_ratio
+    found = Correspondences(
+        np.hstack([source.points[rows], target.points[columns]]),
+        rows,
+        columns,
+        distance.ravel(),
+        ratio.ravel(),
+        mutual,
+    ).take(keep)
+    if len(found) <= config.max_correspondences or found.ratio is None:
+        return found
+    best = np.argsort(found.ratio, kind="stable")[: config.max_correspondences]
+    return found.take(np.sort(best))
+
+
+def nearest_features(
+    source: Float32Array, target: Float32Array, neighbors: int
+) -> tuple[IntArray, Float32Array, Float32Array, IntArray]:
+    """The nearest target features of each source feature, and the way back.
+
+    Args:
+        source: (n, d) unit features.
+        target: (m, d) unit features.
+        neighbors: targets k per source feature; fewer where m is smaller.
+
+    Returns:
+        Index (n, k) of the nearest targets, best first; their Euclidean distance (n, k); the ratio (n, k)
+        of that distance to the one of the next best target outside the k (1 where there is none or where
+        both are zero); and for each target (m,) its nearest source.
+    """
+    k = min(neighbors, len(target))
+    index = np.empty((len(source), k), dtype=np.int64)
+    best = np.empty((len(source), k), dtype=np.float32)
+    beyond = np.full(len(source), -np.inf, dtype=np.float32)
+    backward = np.zeros(len(target), dtype=np.int64)
+    backward_best = np.full(len(target), -np.inf, dtype=np.float32)
+    step = max(1, _BLOCK_ENTRIES // len(target))
+    for start in range(0, len(source), step):
+        similarity = source[start : start + step] @ target.T
+        stop = start + len(similarity)
+        rows = np.arange(len(similarity))
+        column_best = similarity.argmax(0)
+        column_value = similarity[column_best, np.arange(len(target))]
+        better = column_value > backward_best
+        backward[better] = column_best[better] + start
+        backward_best[better] = column_value[better]
+        for rank in range(k):
+            choice = similarity.argmax(1)
+            index[start:stop, rank] = choice
+            best[start:stop, rank] = similarity[rows, choice]
+            similarity[rows, choice] = -np.inf
+        if k < len(target):
+            beyond[start:stop] = similarity.max(1)
+    distance = np.sqrt(np.maximum(2 - 2 * best, 0))
+    next_distance = np.sqrt(np.maximum(2 - 2 * np.where(np.isfinite(beyond), beyond, 1), 0))[:, None]
+    usable = np.isfinite(beyond)[:, None] & (next_distance > 0)
+    ratio = np.where(usable, distance / np.where(usable, next_distance, 1), 1)
+    return index, distance, np.minimum(ratio, 1).astype(np.float32), backward

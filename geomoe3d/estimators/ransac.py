@@ -1,0 +1,74 @@
+"""RANSAC on correspondences: Open3D's, behind the form all estimators share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geomoe3d.estimators.base import check_correspondences
+from geomoe3d.geometry.rigid_fit import spread, squared_residuals
+from geomoe3d.types import Hypothesis
+
+
+@dataclass(frozen=True)
+class RansacEstimator:
+    """Open3D's RANSAC with the edge-length and distance checkers.
+
+    Attributes:
+        iterations: upper bound on the number of samples.
+        confidence: stops earlier once an all-inlier sample was drawn with this probability.
+        edge_length_similarity: a sample is skipped when two of its edges differ by more than this factor.
+    """
+
+    iterations: int = 50_000
+    confidence: float = 0.999
+    edge_length_similarity: float = 0.9
+
+    def __call__(
+        self,
+        correspondences: ArrayLike,
+        weights: ArrayLike | None = None,
+        *,
+        inlier_threshold: float,
+        seed: int = 0,
+    ) -> list[Hypothesis]:
+        """See `Estimator`. Weights only select: correspondences of weight zero are left out.
+
+        Open3D answers a search without any inlier with the identity; that is no answer and gives [].
+        """
+        rows, w = check_correspondences(correspondences, weights, inlier_threshold)
+        rows = rows[w > 0]
+        if len(rows) < 3 or min(
+            spread(rows[:, :3], np.ones(len(rows))), spread(rows[:, 3:], np.ones(len(rows)))
+        ) < (1e-6 * inlier_threshold):
+            return []
+        import open3d as o3d
+
+        registration = o3d.pipelines.registration
+        o3d.utility.random.seed(seed)
+        clouds = [
+            o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rows[:, s])) for s in (slice(3), slice(3, 6))
+        ]
+        pairs = o3d.utility.Vector2iVector(np.repeat(np.arange(len(rows), dtype=np.int32)[:, None], 2, 1))
+        answer = registration.registration_ransac_based_on_correspondence(
+            clouds[0],
+            clouds[1],
+            pairs,
+            inlier_threshold,
+            registration.TransformationEstimationPointToPoint(False),
+            3,
+            [
+                registration.CorrespondenceCheckerBasedOnEdgeLength(self.edge_length_similarity),
+                registration.CorrespondenceCheckerBasedOnDistance(inlier_threshold),
+            ],
+            registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
+        )
+        T = np.array(answer.transformation, dtype=np.float64)
+        r2 = squared_residuals(T[None, :3, :3], T[None, :3, 3], rows[:, :3], rows[:, 3:])[0]
+        num_inliers = int((r2 < inlier_threshold**2).sum())
+        if len(answer.correspondence_set) < 3 or num_inliers < 3:
+            return []
+        score = float(np.maximum(1 - r2 / inlier_threshold**2, 0).sum())
+        return [Hypothesis(T, score, num_inliers)]

@@ -1,0 +1,93 @@
+"""Least-squares rigid motions for many weighted point sets at once, in numpy.
+
+The estimators of the classical path call these thousands of times per registration and must work where
+torch is absent; the differentiable twin for training is `geomoe3d.geometry.kabsch`. Cost: O(total number
+of points) plus one 3x3 singular value decomposition per set.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+
+
+def fit_rigid(source: Floats, target: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Weighted Kabsch: the R, t minimising sum_i w_i |R p_i + t - q_i|^2 for every set of a batch.
+
+    Args:
+        source: (..., N, 3) points p.
+        target: (..., N, 3) points q.
+        weights: (..., N) non-negative, any scale.
+
+    Returns:
+        R (..., 3, 3) with determinant +1 and t (..., 3), in the dtype of ``source``. Where the points do
+        not determine a rotation (coincident, collinear, all weights zero) it is one of the minimisers:
+        check the sets, not the matrix.
+
+    Source: Kabsch 1976; the sign of the smallest direction is chosen so that det R = +1 (Umeyama 1991).
+    """
+    w = weights / np.maximum(weights.sum(-1, keepdims=True), np.finfo(weights.dtype).tiny)
+    source_mean = np.einsum("...n,...nd->...d", w, source)
+    target_mean = np.einsum("...n,...nd->...d", w, target)
+    H = np.swapaxes((source - source_mean[..., None, :]) * w[..., None], -1, -2) @ (
+        target - target_mean[..., None, :]
+    )
+    return _motion(H, source_mean, target_mean)
+
+
+def fit_rigid_shared(source: Floats, target: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """`fit_rigid` for K weightings of the same N points, through moments and one matrix product.
+
+    Args:
+        source: (N, 3) points, near their centroid (moments cancel badly far from it).
+        target: (N, 3) points, near their centroid.
+        weights: (K, N) non-negative.
+
+    Returns:
+        R (K, 3, 3), t (K, 3) as in `fit_rigid`.
+    """
+    total = np.maximum(weights.sum(1), np.finfo(weights.dtype).tiny)[:, None]
+    source_mean = weights @ source / total
+    target_mean = weights @ target / total
+    products = (source[:, :, None] * target[:, None, :]).reshape(len(source), 9)
+    H = (weights @ products / total).reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
+    return _motion(H, source_mean, target_mean)
+
+
+def _motion(H: Floats, source_mean: Floats, target_mean: Floats) -> tuple[Floats, Floats]:
+    U, _, Vt = np.linalg.svd(H.astype(np.float64))
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    V = np.swapaxes(Vt, -1, -2).copy()
+    V[..., :, 2] *= sign[..., None]
+    R = (V @ np.swapaxes(U, -1, -2)).astype(H.dtype)
+    t = target_mean - np.einsum("...ij,...j->...i", R, source_mean)
+    return R, t
+
+
+def squared_residuals(R: Floats, t: Floats, source: Floats, target: Floats) -> Floats:
+    """|R_k p_n + t_k - q_n|^2 for K motions and N correspondences: (K, N)."""
+    moved = (R.reshape(-1, 3) @ source.T).reshape(len(R), 3, -1)
+    moved += t[:, :, None]
+    moved -= target.T[None]
+    moved *= moved
+    result: Floats = moved.sum(1)
+    return result
+
+
+def spread(points: Floats, weights: Floats) -> float:
+    """Second largest standard deviation of weighted points (N, 3): zero where they are collinear.
+
+    Three directions of scatter decide a rigid fit: with the second at zero the rotation about the line is
+    free. Returns 0 for no points or zero weights.
+    """
+    total = weights.sum()
+    if total <= 0:
+        return 0.0
+    mean = weights @ points / total
+    centred = (points - mean).astype(np.float64)
+    covariance = (centred * weights[:, None]).T @ centred / total
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)))

@@ -63,7 +63,7 @@ def render_page(view: RegistrationView) -> str:
     result = view.result
     source, target = result.source.name, result.target.name
     values = {
-        "version": _escape(result.versions.get("geomoe3d", "")),
+        "made_by": _escape(f"geomoe3d {result.versions.get('geomoe3d', '')}".strip()),
         "title": _escape(f"{source} on {target}: {STATUS_WORDS[result.status]}"),
         "stage_label": _escape(f"Point clouds {source} and {target}, {STATUS_WORDS[result.status]}"),
         "status": result.status,

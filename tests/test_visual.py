@@ -774,6 +774,7 @@ def test_window_content_switches():
 # ---------------------------------------------------------------- real scans
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_real_kitchen(tmp_path):
     folder = DATA / "fullres"

@@ -188,7 +188,8 @@ def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
 
 def _unit(normals: FloatArray) -> FloatArray | None:
     """Normals of length 1, or None if one has no direction."""
-    lengths = np.linalg.norm(normals, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(normals, axis=1)
     if not (np.isfinite(lengths).all() and (lengths > 1e-12).all()):
         return None
     unit: FloatArray = normals / lengths[:, None]

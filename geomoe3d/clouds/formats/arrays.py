@@ -31,7 +31,9 @@ def read_npy(path: Path) -> RawCloud:
     try:
         with path.open("rb") as handle:
             array = np.load(handle, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+    except (MemoryError, OSError):
+        raise
+    except Exception as error:  # numpy's header parser has many ways to refuse
         raise FormatError(f"'{path}' {_numpy_reason(error)}") from None
     if not isinstance(array, np.ndarray):
         array.close()
@@ -47,9 +49,7 @@ def read_npz(path: Path) -> RawCloud:
             colours of another shape.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise FormatError(f"'{path}' is a single NPY array; rename it to .npy")
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
             keys = {key.lower(): key for key in reversed(archive.files)}
             wanted = [next((keys[k] for k in names if k in keys), None) for names in _KEY_GROUPS]
             if wanted[0] is None and len(archive.files) == 1:
@@ -60,9 +60,9 @@ def read_npz(path: Path) -> RawCloud:
                     f"keys known: {', '.join(_POINT_KEYS)}"
                 )
             arrays = [None if key is None else archive[key] for key in wanted]
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError, OSError) as error:
-        if isinstance(error, FormatError) or (isinstance(error, OSError) and error.errno is not None):
-            raise
+    except (FormatError, MemoryError, OSError):
+        raise
+    except Exception as error:  # zipfile and zlib have many ways to refuse
         raise FormatError(f"'{path}' {_numpy_reason(error)}") from None
     points, normals, colors = arrays
     assert points is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -37,6 +38,7 @@ def read_las(path: Path) -> RawCloud:
         DependencyError: laspy (or lazrs for LAZ) is absent.
     """
     laspy = _laspy(path.suffix.lower() == ".laz")
+    _check_records(path)
     try:
         with laspy.open(path) as reader:
             header = reader.header
@@ -70,16 +72,71 @@ def _wrong_count(path: Path, said: int, held: int) -> FormatError:
     return FormatError(f"'{path}': the header says {said} points, the file holds {held}; {reason}")
 
 
+def _check_records(path: Path) -> None:
+    """The numbers of records that laspy would believe and loop over, against the room there is for them."""
+    size = path.stat().st_size
+    with path.open("rb") as handle:
+        head = handle.read(375)
+    if len(head) < 227 or head[:4] != b"LASF":
+        raise FormatError(f"'{path}' is no LAS file or truncated: {size} bytes, starting with {head[:4]!r}")
+    header_size, first, num_records = struct.unpack("<HII", head[94:104])
+    if first > size:
+        raise FormatError(f"'{path}': the points begin at byte {first}, the file holds {size}; truncated")
+    room = first - header_size
+    if num_records * 54 > room:
+        raise FormatError(
+            f"'{path}' is damaged: its header says {num_records} records before the points, {room} bytes "
+            "cannot hold them"
+        )
+    num_records = struct.unpack("<I", head[243:247])[0] if head[25] >= 4 and len(head) == 375 else 0
+    if num_records * 60 > size:
+        raise FormatError(
+            f"'{path}' is damaged: its header says {num_records} records behind the points, {size} bytes "
+            "cannot hold them"
+        )
+
+
 def _check_size(path: Path, header: Any) -> None:
-    """Hold the count of an uncompressed file against its size, which laspy does not."""
+    """Hold the header against the file's size, which laspy does not."""
+    size = path.stat().st_size
     if header.are_points_compressed:
+        _check_chunk_table(path, header, size)
         return
-    held = (path.stat().st_size - header.offset_to_point_data) // header.point_format.size
+    held = (size - header.offset_to_point_data) // header.point_format.size
     followed = getattr(header, "number_of_evlrs", 0) or getattr(
         header, "start_of_waveform_data_packet_record", 0
     )
     if held < header.point_count or (held > header.point_count and not followed):
         raise _wrong_count(path, header.point_count, max(held, 0))
+
+
+def _check_chunk_table(path: Path, header: Any, size: int) -> None:
+    """LAZ keeps a table behind the points; on a broken one lazrs ends the whole process."""
+    first = header.offset_to_point_data
+    with path.open("rb") as handle:
+        handle.seek(first)
+        place = int.from_bytes(handle.read(8), "little", signed=True)
+        if place == -1:  # written by a stream: the place is at the file's end
+            handle.seek(max(0, size - 8))
+            place = int.from_bytes(handle.read(8), "little", signed=True)
+        if not first + 8 <= place <= size - 8:
+            raise FormatError(
+                f"'{path}': the header says {header.point_count} points with a table at byte {place}, the "
+                f"file holds {size} bytes; it is truncated or damaged"
+            )
+        handle.seek(place + 4)
+        num_chunks = int.from_bytes(handle.read(4), "little")
+    if num_chunks > place - first:
+        raise FormatError(
+            f"'{path}' is damaged: its table says {num_chunks} chunks, {place - first} bytes cannot hold them"
+        )
+    records = header.vlrs.get("LasZipVlr")
+    chunk_points = int.from_bytes(records[0].record_data[12:16], "little") if records else 0
+    if 0 < chunk_points < 0xFFFFFFFF and -(-header.point_count // chunk_points) != num_chunks:
+        raise FormatError(
+            f"'{path}': the header says {header.point_count} points, the file holds {num_chunks} chunks of at "
+            f"most {chunk_points}; its header is wrong"
+        )
 
 
 def write_las(handle: BinaryIO, cloud: RawCloud, compressed: bool) -> None:

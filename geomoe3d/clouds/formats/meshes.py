@@ -6,8 +6,11 @@ first; OBJ states none, so a truncated OBJ can only be noticed when a face names
 
 from __future__ import annotations
 
+import logging
 import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +20,7 @@ import numpy as np
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.text import write_rows
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.errors import EmptyCloudError, FormatError, InputError
+from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
@@ -34,18 +37,32 @@ def load_scene(path: Path) -> Any:
         check(path)
     import trimesh
 
-    try:
+    with _as_format_errors(path):
         return trimesh.load(str(path), process=False)
-    except (MemoryError, PermissionError):
+
+
+@contextmanager
+def _as_format_errors(path: Path) -> Iterator[None]:
+    """Turn whatever trimesh's loaders let through into `FormatError`, and keep its log off the terminal."""
+    log = logging.getLogger("trimesh")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    except (GeoMoE3DError, MemoryError, PermissionError):
         raise
-    except Exception as error:  # trimesh's loaders let all kinds of errors through
-        kind = suffix[1:].upper()
+    except Exception as error:
+        kind = path.suffix[1:].upper()
         raise FormatError(f"'{path}' cannot be read as {kind}: {type(error).__name__}: {error}") from None
+    finally:
+        log.setLevel(level)
 
 
 def read_mesh(path: Path) -> RawCloud:
     """All geometry of a mesh file in one frame, transforms of the scene graph applied."""
-    return flatten(load_scene(path), f"'{path}'")
+    scene = load_scene(path)
+    with _as_format_errors(path):
+        return flatten(scene, f"'{path}'")
 
 
 def _check_stl(path: Path) -> None:
@@ -105,7 +122,11 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
     """
     parts = []
     for item, T in _placed(geometry):
-        vertices = transform_points(T, np.asarray(item.vertices, dtype=np.float64))
+        vertices = np.array(item.vertices, dtype=np.float64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise FormatError(f"{what}: the vertices have shape {vertices.shape}, expected (N, 3)")
+        if not np.array_equal(T, np.eye(4)):  # keeps unmoved vertices exact
+            vertices = transform_points(T, vertices)
         faces = (
             np.asarray(item.faces, dtype=np.int64) if hasattr(item, "faces") else np.empty((0, 3), np.int64)
         )

@@ -137,8 +137,8 @@ def _wrong_count(path: Path, said: int, held: int) -> FormatError:
 def _read_ascii(
     handle: BinaryIO, path: Path, header: _Header, groups: dict[str, list[int]]
 ) -> dict[str, NDArray[Any]]:
-    lines = DataLines(io.TextIOWrapper(handle, encoding="latin-1"), header.num_lines)
-    table = parse_table(path, lines, None, sum(header.counts))
+    with io.TextIOWrapper(handle, encoding="latin-1") as text:
+        table = parse_table(path, DataLines(text, header.num_lines), None, sum(header.counts))
     if len(table) != header.num_points:
         raise _wrong_count(path, header.num_points, len(table))
     first = np.concatenate([[0], np.cumsum(header.counts)])[:-1]
@@ -163,7 +163,19 @@ def _read_binary(
     surplus = rest - header.num_points * itemsize
     if held < header.num_points or surplus >= itemsize:
         raise _wrong_count(path, header.num_points, held)
-    return read_columns(handle, header.dtype, header.num_points, groups)
+    columns = read_columns(handle, header.dtype, header.num_points, groups)
+    _check_end(handle, path)
+    return columns
+
+
+def _check_end(handle: BinaryIO, path: Path) -> None:
+    """Nothing but padding may follow the points."""
+    place = handle.tell()
+    if handle.read(64).strip(b"\0\r\n\t "):
+        size = path.stat().st_size
+        raise FormatError(
+            f"'{path}' is {size} bytes long, its header describes {place}; it is damaged or misdescribed"
+        )
 
 
 def _read_compressed(handle: BinaryIO, path: Path, header: _Header) -> RawCloud:
@@ -177,6 +189,8 @@ def _read_compressed(handle: BinaryIO, path: Path, header: _Header) -> RawCloud:
         )
     if unpacked != header.num_points * header.dtype.itemsize:
         raise _wrong_count(path, header.num_points, unpacked // header.dtype.itemsize)
+    handle.seek(packed, io.SEEK_CUR)
+    _check_end(handle, path)
     if not header.num_points:
         return RawCloud(np.empty((0, 3)))
     import open3d as o3d

@@ -69,8 +69,8 @@ def read_ply(path: Path) -> RawCloud:
         if vertex.has_lists:
             raise FormatError(f"'{path}': vertices with list properties are not supported")
         if order == "=":
-            text = io.TextIOWrapper(handle, encoding="latin-1")
-            return _read_ascii(DataLines(text, num_lines), path, elements, groups)
+            with io.TextIOWrapper(handle, encoding="latin-1") as text:
+                return _read_ascii(DataLines(text, num_lines), path, elements, groups)
         return _read_binary(handle, path, order, elements, groups)
 
 

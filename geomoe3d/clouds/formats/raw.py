@@ -98,7 +98,8 @@ def split_columns(table: FloatArray, names: Sequence[str] | None) -> RawCloud:
 
 
 def _guess_role(triple: FloatArray) -> str | None:
-    lengths = np.linalg.norm(triple[np.isfinite(triple).all(axis=1)], axis=1)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(triple[np.isfinite(triple).all(axis=1)], axis=1)
     if len(lengths) and np.mean(np.abs(lengths - 1.0) <= 0.01) >= 0.99:
         return "normals"
     if len(triple) and np.nanmin(triple, initial=0.0) >= 0 and np.nanmax(triple, initial=0.0) <= 255:
@@ -149,15 +150,16 @@ def read_columns(
     fields = dtype.names or ()
     out: dict[str, NDArray[Any]] = {}
     for group, columns in groups.items():
-        stored = dtype[fields[columns[0]]].newbyteorder("=")
+        stored = np.result_type(*(dtype[fields[column]] for column in columns)).newbyteorder("=")
         kind = np.dtype(np.float64) if group in ("points", "normals") else stored
         out[group] = np.empty((count, len(columns)), dtype=kind)
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
     for start in range(0, count, rows):
         block = np.fromfile(handle, dtype=dtype, count=min(rows, count - start))
-        for group, columns in groups.items():
-            for k, column in enumerate(columns):
-                out[group][start : start + len(block), k] = block[fields[column]]
+        with np.errstate(invalid="ignore"):  # signalling NaNs are dropped later
+            for group, columns in groups.items():
+                for k, column in enumerate(columns):
+                    out[group][start : start + len(block), k] = block[fields[column]]
     return out
 
 

@@ -1,0 +1,1 @@
+"""From correspondences to weights: the network, its parts, and classical filters."""

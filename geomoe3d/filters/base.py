@@ -1,0 +1,90 @@
+"""The one form of a filter, and the choice by name.
+
+A filter gives every putative correspondence a weight; it drops nothing and knows no transform. Place:
+weigh, between match and solve. New filters join by a line in `_FACTORIES`; the pipeline does not change.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from geomoe3d.errors import ConfigError
+from geomoe3d.types import Correspondences, FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class FilterOutput:
+    """What a filter says of N correspondences.
+
+    Attributes:
+        weights: (N,) in [0, 1]; 0 takes a correspondence out of the estimate.
+        logits: (N,) raw scores, larger is likelier an inlier, or None.
+        groups: (N,) small integers, which part of the filter handled each correspondence, or None.
+        group_names: a name for each group, for display.
+    """
+
+    weights: FloatArray
+    logits: FloatArray | None = None
+    groups: IntArray | None = None
+    group_names: tuple[str, ...] = ()
+
+
+class Filter(Protocol):
+    """Anything that weighs correspondences."""
+
+    def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
+        """Weigh correspondences.
+
+        Args:
+            correspondences: N rows in local coordinates; the per-row attributes may be None.
+            voxel_size: the grid the points came from, cloud units: what the scale of noise is.
+            seed: decides every random choice.
+
+        Returns:
+            One weight per correspondence; for N = 0 an empty array.
+        """
+        ...
+
+
+class NoFilter:
+    """All correspondences weigh the same."""
+
+    def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
+        """See `Filter`: all ones."""
+        return FilterOutput(np.ones(len(correspondences)))
+
+
+def _none() -> Filter:
+    return NoFilter()
+
+
+def _spectral() -> Filter:
+    from geomoe3d.filters.spectral import SpectralFilter
+
+    return SpectralFilter()
+
+
+_FACTORIES: dict[str, Callable[[], Filter]] = {"none": _none, "spectral": _spectral}
+
+
+def filter_names() -> list[str]:
+    """Names that `make_filter` knows."""
+    return list(_FACTORIES)
+
+
+def make_filter(name: str) -> Filter:
+    """The filter of a given name.
+
+    Raises:
+        ConfigError: no filter has this name; the message gives the nearest one.
+    """
+    if name in _FACTORIES:
+        return _FACTORIES[name]()
+    close = difflib.get_close_matches(name, _FACTORIES, n=1, cutoff=0.4)
+    hint = f"did you mean '{close[0]}'?" if close else "known: " + ", ".join(_FACTORIES)
+    raise ConfigError(f"unknown filter '{name}'; {hint}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -12,10 +13,20 @@ from geomoe3d.errors import ConfigError
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.blocks import BatchNorm, ContextNorm, GraphAttention, SubFieldPool
 from geomoe3d.filters.counting import count_cost, num_parameters
-from geomoe3d.filters.geomoe import GeoMoE, find_neighbors, weights_from_logits
+from geomoe3d.filters.geomoe import GeoMoE, find_neighbors
+from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.filters.moe import FMoE
 
 TINY = NetworkConfig(num_layers=2, width=16, num_sub_fields=6, num_heads=2, expert_width=4)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Tensors here are so small that threads only get in each other's way."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def tiny(**changes: object) -> GeoMoE:

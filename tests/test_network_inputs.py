@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 import torch
@@ -20,6 +22,15 @@ STRONGER = NetworkConfig(extra_channels=("compatibility", "hypothesis"), knn_spa
 BLIND = NetworkConfig(
     extra_channels=("compatibility", "hypothesis"), knn_space="compatibility", motion_form="none"
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Tensors here are so small that threads only get in each other's way."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def scene(num: int = 120, inliers: int = 40, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from geomoe3d.filters.blocks import BatchNorm, ContextNorm, GraphAttention, Pointwise, SubFieldPool
-from geomoe3d.filters.geomoe import ChannelPath, GeoMoE
+from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.layers import ChannelPath
 from geomoe3d.filters.moe import FMoE
 
 

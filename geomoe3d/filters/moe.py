@@ -68,19 +68,25 @@ class FMoE(nn.Module):
 
     def route(self, z: Tensor) -> Routing:
         """Experts for the sub-fields (B, C, M); with ``top_k_softmax`` the weights of each sum to one."""
-        logits = self.router(z).float()
-        if self.router_order == "top_k_softmax":
-            best, chosen = logits.topk(self.top_k, dim=1)
-            kept = best.softmax(dim=1)
-        else:
-            kept, chosen = logits.softmax(dim=1).topk(self.top_k, dim=1)
-        weights = torch.zeros_like(logits).scatter(1, chosen, kept)
+        logits = self.router(z)
+        logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
+        weights = expert_weights(logits, self.top_k, self.router_order)
         usage = weights.mean(dim=(0, 2))
         num_experts = len(usage)
         factor = num_experts if self.load_balance == "normalised" else 1 / num_experts
         log_probability = logits.detach().log_softmax(dim=1)
         entropy = -(log_probability.exp() * log_probability).sum(1).mean() / max(math.log(num_experts), 1e-9)
         return Routing(weights, factor * usage.square().sum(), usage.detach(), entropy)
+
+
+def expert_weights(logits: Tensor, top_k: int, router_order: str) -> Tensor:
+    """Router logits (..., T, M) to the weights of the chosen experts, zero elsewhere."""
+    if router_order == "top_k_softmax":
+        best, chosen = logits.topk(top_k, dim=-2)
+        kept = best.softmax(dim=-2)
+    else:
+        kept, chosen = logits.softmax(dim=-2).topk(top_k, dim=-2)
+    return torch.zeros_like(logits).scatter(-2, chosen, kept)
 
 
 class DenseFeedForward(nn.Module):

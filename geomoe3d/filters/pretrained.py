@@ -73,7 +73,9 @@ def save_pretrained(path: str | Path, model: GeoMoE, card: WeightCard, *, force:
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     data = save(tensors)
     write_atomically(path, lambda temporary: _write(temporary, data), force=force)
-    values = asdict(card) | {"architecture": model.config.model_dump(mode="json"), "sha256": hashlib.sha256(data).hexdigest()}
+    values = asdict(card)
+    values["architecture"] = model.config.model_dump(mode="json")
+    values["sha256"] = hashlib.sha256(data).hexdigest()
     text = json.dumps({"format": _FORMAT, "version": _VERSION, **values}, indent=2) + "\n"
     write_atomically(card_path(path), lambda temporary: _write(temporary, text.encode()), force=force)
     return WeightCard(**values)

@@ -16,7 +16,8 @@ from pydantic import Field
 from torch import Tensor
 
 from geomoe3d.config import Section
-from geomoe3d.filters.geomoe import GeoMoEOutput, weights_from_logits
+from geomoe3d.filters.geomoe import GeoMoEOutput
+from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.geometry.kabsch import weighted_kabsch
 
 _MIN_POSITIVE = 3

@@ -9,7 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from geomoe3d.filters.geomoe import GeoMoE, weights_from_logits
+from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.training.batches import Batch, Sample, make_batch
 

@@ -5,7 +5,7 @@
 checkout=$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd)
 venv="$checkout/.venv"
 python="$venv/bin/python"
-torch_version=2.13.0
+torch_version=$(sed -n 's/^torch==//p' "$checkout/constraints.txt")
 
 say() { printf '\n== %s\n' "$*"; }
 fail() {
@@ -70,9 +70,10 @@ install_system_libraries() {
   install_packages $missing
 }
 
-# pip, silent but for the packages that it installed.
+# pip with the tested versions, silent but for the packages that it installed.
 pip_install() {
-  "$python" -m pip install --disable-pip-version-check --progress-bar off "$@" |
+  "$python" -m pip install --disable-pip-version-check --progress-bar off \
+    --constraint "$checkout/constraints.txt" "$@" |
     sed -n 's/^Successfully installed/installed:/p'
 }
 
@@ -91,11 +92,11 @@ install_torch() {
   fi
 }
 
-# install_package [EXTRA,...]: this checkout, editable. Done again only after pyproject.toml changed.
+# install_package EXTRA,...: this checkout, editable. Done again only after a change of what it depends on.
 install_package() {
   local extras="${1:+[$1]}" stamp state
   stamp="$venv/.geomoe3d${1:+-$1}"
-  state=$(cksum <"$checkout/pyproject.toml")" $checkout"
+  state=$(cat "$checkout/pyproject.toml" "$checkout/constraints.txt" | cksum)" $checkout"
   if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$state" ]; then return; fi
   say "geomoe3d$extras and the Python packages it depends on"
   (cd "$checkout" && pip_install --editable ".$extras")

@@ -136,11 +136,28 @@ def test_precommit_uses_the_pinned_tools():
     assert hooks["mypy"]["name"] == f"mypy {pinned['mypy']}"
 
 
+def constraints():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return dict(line.split("==") for line in lines if not line.startswith("#"))
+
+
 def test_set_up_installs_the_torch_that_the_doctor_recommends():
     from geomoe3d.doctor import TORCH
 
-    script = (ROOT / "scripts" / "environment.sh").read_text()
-    assert "torch==" + re.search(r"^torch_version=(.*)$", script, re.MULTILINE)[1] == TORCH
+    assert f"torch=={constraints()['torch']}" == TORCH
+
+
+def test_every_declared_dependency_has_a_tested_version_within_its_range():
+    from packaging.requirements import Requirement
+
+    tables = pyproject().split("dependencies = [", 1)[1].split("[project.scripts]")[0]
+    requirements = [Requirement(text) for text in re.findall(r'"([^"]+)"(?:,|\]|\n)', tables)]
+    assert len(requirements) > 15
+    tested = {name.lower(): version for name, version in constraints().items()}
+    for requirement in requirements:
+        exact = any(specifier.operator == "==" for specifier in requirement.specifier)
+        if not exact and requirement.name not in ("pre-commit", "kiss-matcher"):
+            assert tested[requirement.name.lower()] in requirement.specifier, requirement
 
 
 def test_the_readme_has_two_commands_of_set_up_and_links_that_exist():

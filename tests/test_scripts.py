@@ -107,7 +107,7 @@ def torch_calls(shell, pip, **environment):
     """What pip is asked for where torch is not installed; ``pip`` is what becomes of it."""
     shell.program("fake-python", f'case "$*" in *importlib*) exit 1;; *) {pip};; esac')
     code, said, calls = shell.run("python=fake-python; install_torch", **environment)
-    return code, said, [call.split("--progress-bar off ")[1] for call in calls if " pip install " in call]
+    return code, said, [call.split("constraints.txt ")[1] for call in calls if " pip install " in call]
 
 
 def test_torch_without_a_gpu_is_the_cpu_build_where_there_is_one(shell):
@@ -144,11 +144,17 @@ def test_torch_that_is_there_is_left_alone(shell):
 def test_the_package_is_installed_again_only_after_its_metadata_changed(shell, tmp_path):
     checkout = tmp_path / "my checkout"
     (checkout / ".venv").mkdir(parents=True)
-    (checkout / "pyproject.toml").write_text("one")
+    for name in ("pyproject.toml", "constraints.txt"):
+        (checkout / name).write_text("one")
     shell.program("fake-python")
     code = f'python=fake-python; checkout="{checkout}"; venv="$checkout/.venv"; install_package dev,las'
-    for text, count in (("one", 1), ("one", 1), ("two", 2)):
-        (checkout / "pyproject.toml").write_text(text)
+    for name, text, count in (
+        ("pyproject.toml", "one", 1),
+        ("pyproject.toml", "two", 2),
+        ("pyproject.toml", "two", 2),
+        ("constraints.txt", "two", 3),
+    ):
+        (checkout / name).write_text(text)
         assert shell.run(code)[0] == 0
         calls = [call for call in shell.log.read_text().splitlines() if "--editable .[dev,las]" in call]
         assert len(calls) == count

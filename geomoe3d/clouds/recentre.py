@@ -33,9 +33,23 @@ def choose_origin(points: FloatArray) -> FloatArray:
     Returns:
         (3,) whole numbers.
     """
-    low, median, high = np.array([np.percentile(points[:, k], (5, 50, 95)) for k in range(3)]).T
-    spread = float(np.max(high - low))
+    median, spread = _median_and_spread(points)
     if float(np.abs(median).max()) <= NEAR_ZERO_SPREADS * spread:
         return np.zeros(3)
     origin: FloatArray = np.floor(median + 0.5)
     return origin + 0.0  # no negative zeros
+
+
+def fits_single_precision(points: FloatArray) -> bool:
+    """Whether float32 moves no coordinate of points (N, 3), N >= 1, by more than 1e-6 of the spread."""
+    _, spread = _median_and_spread(points)
+    with np.errstate(over="ignore"):
+        return all(
+            float(np.abs(points[:, k].astype(np.float32) - points[:, k]).max()) <= 1e-6 * spread
+            for k in range(3)
+        )
+
+
+def _median_and_spread(points: FloatArray) -> tuple[FloatArray, float]:
+    low, median, high = np.array([np.percentile(points[:, k], (5, 50, 95)) for k in range(3)]).T
+    return median, float(np.max(high - low))

@@ -27,7 +27,7 @@ from geomoe3d.types import FloatArray
 
 _CLOUD_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
     ".ply": ply.write_ply,
-    ".pcd": lambda handle, cloud: pcd.write_pcd(handle, cloud, not choose_origin(cloud.points).any()),
+    ".pcd": pcd.write_pcd,
     ".xyz": lambda handle, cloud: text.write_text(handle, cloud, ".xyz"),
     ".txt": lambda handle, cloud: text.write_text(handle, cloud, ".txt"),
     ".csv": lambda handle, cloud: text.write_text(handle, cloud, ".csv"),
@@ -113,9 +113,9 @@ def save_points(
 ) -> None:
     """Write points in file coordinates; the suffix decides the format.
 
-    PLY (binary), NPY, NPZ, XYZ, TXT and CSV return every coordinate bit for bit. PCD does so far from zero;
-    near zero it holds floats, which round by less than 1e-6 of the cloud's spread (`pcd.write_pcd` says
-    why). LAS and LAZ round to a grid of a power of ten, at most 1e-8 of the extent: half of 1e-7 for a
+    PLY (binary), NPY, NPZ, XYZ, TXT and CSV return every coordinate bit for bit. PCD holds floats where
+    those move no coordinate by more than 1e-6 of the cloud's spread, and every digit elsewhere (`write_pcd`
+    says why). LAS and LAZ round to a grid of a power of ten, at most 1e-8 of the extent: half of 1e-7 for a
     cloud of 100 units. Colours are kept to half of 1/255 by PLY and PCD, to half of 1/65535 by LAS (half of
     1/255 when all are nearly black), exactly by text and NPZ.
 

@@ -134,8 +134,8 @@ def _check_chunk_table(path: Path, header: Any, size: int) -> None:
     chunk_points = int.from_bytes(records[0].record_data[12:16], "little") if records else 0
     if 0 < chunk_points < 0xFFFFFFFF and -(-header.point_count // chunk_points) != num_chunks:
         raise FormatError(
-            f"'{path}': the header says {header.point_count} points, the file holds {num_chunks} chunks of at "
-            f"most {chunk_points}; its header is wrong"
+            f"'{path}': the header says {header.point_count} points, the file holds {num_chunks} chunks of "
+            f"at most {chunk_points}; its header is wrong"
         )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.text import write_rows
-from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.types import BoolArray, FloatArray, IntArray
@@ -169,7 +169,8 @@ def _placed(geometry: Any) -> list[tuple[Any, FloatArray]]:
 def _vertex_colors(item: Any) -> FloatArray | None:
     if getattr(item.visual, "kind", None) != "vertex":
         return None
-    return scale_colors(np.asarray(item.visual.vertex_colors)[:, :3])
+    colors = np.asarray(item.visual.vertex_colors)
+    return scale_colors(colors[:, :3]) if colors.ndim == 2 and len(colors) == len(item.vertices) else None
 
 
 def without_vertices(mesh: RawCloud, kept: BoolArray) -> RawCloud:
@@ -217,13 +218,13 @@ def _write_faces(handle: BinaryIO, mesh: RawCloud, prefix: str, first: int) -> N
 
 
 def write_stl(handle: BinaryIO, mesh: RawCloud) -> None:
-    """STL: binary (single precision) near zero, ASCII with every digit far from it; no colours."""
+    """STL: binary where single precision suffices, else ASCII with every digit; no colours."""
     assert mesh.faces is not None
     corners = mesh.points[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
-    if choose_origin(mesh.points).any():
+    if not fits_single_precision(mesh.points):
         handle.write(b"solid geomoe3d\n")
         for normal, corner in zip(normals.tolist(), corners.tolist(), strict=True):
             lines = [f"facet normal {normal[0]:.6g} {normal[1]:.6g} {normal[2]:.6g}", "outer loop"]

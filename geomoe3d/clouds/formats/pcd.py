@@ -25,6 +25,7 @@ from geomoe3d.clouds.formats.raw import (
     scale_colors,
 )
 from geomoe3d.clouds.formats.text import DataLines, parse_table
+from geomoe3d.clouds.recentre import fits_single_precision
 from geomoe3d.errors import FormatError
 from geomoe3d.types import FloatArray
 
@@ -213,15 +214,16 @@ def _unpack(packed: NDArray[Any]) -> FloatArray:
     return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255.0
 
 
-def write_pcd(handle: BinaryIO, cloud: RawCloud, near_zero: bool) -> None:
-    """Binary PCD with float coordinates near zero, ASCII with double coordinates far from it.
+def write_pcd(handle: BinaryIO, cloud: RawCloud) -> None:
+    """Binary PCD with float coordinates where those suffice, else ASCII with double coordinates.
 
-    The Point Cloud Library and Open3D's legacy reader take binary floats and misread binary doubles, and
-    near zero (where `choose_origin` gives 0) a float rounds coordinates by less than 1e-6 of the cloud's
-    spread. Far from zero a float would lose whole decimetres, so every digit is printed. Normals are floats,
-    colours 8 bit in a packed rgb.
+    The Point Cloud Library and Open3D's legacy reader take binary floats and misread binary doubles, so
+    floats are written when they move no coordinate by more than 1e-6 of the cloud's spread. At map
+    coordinates they would lose decimetres: there every digit is printed. Normals are floats, colours 8 bit
+    in a packed rgb.
     """
-    size = 4 if near_zero else 8
+    single = fits_single_precision(cloud.points)
+    size = 4 if single else 8
     fields = [(axis, size, "F") for axis in "xyz"]
     if cloud.normals is not None:
         fields += [(f"normal_{axis}", 4, "F") for axis in "xyz"]
@@ -232,7 +234,7 @@ def write_pcd(handle: BinaryIO, cloud: RawCloud, near_zero: bool) -> None:
     for k, key in enumerate(("FIELDS", "SIZE", "TYPE")):
         lines.append(f"{key} {' '.join(str(entry[k]) for entry in fields)}")
     lines += [f"COUNT {' '.join('1' for _ in fields)}", f"WIDTH {num}", "HEIGHT 1"]
-    lines += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {num}", f"DATA {'binary' if near_zero else 'ascii'}"]
+    lines += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {num}", f"DATA {'binary' if single else 'ascii'}"]
     handle.write(("\n".join(lines) + "\n").encode("ascii"))
     dtype = np.dtype([(f"f{k}", f"<{kind.lower()}{size}") for k, (_, size, kind) in enumerate(fields)])
     for part in chunks(num, dtype.itemsize):
@@ -242,7 +244,7 @@ def write_pcd(handle: BinaryIO, cloud: RawCloud, near_zero: bool) -> None:
         if cloud.colors is not None:
             r, g, b = np.rint(cloud.colors[part] * 255.0).astype(np.uint32).T
             columns.append((r << 16) | (g << 8) | b)
-        if near_zero:
+        if single:
             block = np.empty(part.stop - part.start, dtype=dtype)
             for k, column in enumerate(columns):
                 block[f"f{k}"] = column

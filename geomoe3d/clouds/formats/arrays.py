@@ -31,6 +31,7 @@ def read_npy(path: Path) -> RawCloud:
     try:
         with path.open("rb") as handle:
             array = np.load(handle, allow_pickle=False)
+            place = handle.tell()
     except (MemoryError, OSError):
         raise
     except Exception as error:  # numpy's header parser has many ways to refuse
@@ -38,6 +39,10 @@ def read_npy(path: Path) -> RawCloud:
     if not isinstance(array, np.ndarray):
         array.close()
         raise FormatError(f"'{path}' is an NPZ archive; rename it to .npz")
+    if place != path.stat().st_size:
+        raise FormatError(
+            f"'{path}' is {path.stat().st_size} bytes long, its header describes {place}; its header is wrong"
+        )
     return split_columns(_table(array, f"'{path}'"), None)
 
 
@@ -49,6 +54,9 @@ def read_npz(path: Path) -> RawCloud:
             colours of another shape.
     """
     try:
+        with path.open("rb") as handle:
+            if handle.read(6) == np.lib.format.MAGIC_PREFIX:
+                raise FormatError(f"'{path}' is a single NPY array; rename it to .npy")
         with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
             keys = {key.lower(): key for key in reversed(archive.files)}
             wanted = [next((keys[k] for k in names if k in keys), None) for names in _KEY_GROUPS]

@@ -639,16 +639,21 @@ def test_output_places_that_do_not_work(tmp_path: Path, monkeypatch: pytest.Monk
         ):
             with pytest.raises(error, match=word.replace("?", r"\?").replace(".", r"\.")[:60]):
                 call(path)
+    with pytest.raises(OutputError, match="too long"):
+        check_output(tmp_path / ("a" * 300 + ".ply"), True, WRITABLE_SUFFIXES)
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
     with pytest.raises(OutputError, match="may not be written"):
         check_output(tmp_path / "a.ply", True, WRITABLE_SUFFIXES)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_unwritable_folder(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(OutputError, match="may not be written"):
-        save_points(tmp_path / "a.ply", cloud())
+def test_unwritable_and_unsearchable_folders(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    for mode in (0o500, 0):
+        (tmp_path / "folder").chmod(mode)
+        with pytest.raises(OutputError, match=r"may not be written|[Pp]ermission denied"):
+            save_points(tmp_path / "folder" / "a.ply", cloud())
+    (tmp_path / "folder").chmod(0o700)
 
 
 @pytest.mark.parametrize(

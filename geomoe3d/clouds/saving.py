@@ -63,6 +63,16 @@ def check_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str,
             may not be written to.
     """
     path = Path(path)
+    try:
+        _check_place(path, force, suffixes)
+    except OutputError:
+        raise
+    except OSError as error:  # a name too long, a folder on the way that may not be searched
+        raise OutputError(f"cannot write '{path}': {error.strerror or error}") from None
+    return path
+
+
+def _check_place(path: Path, force: bool, suffixes: tuple[str, ...]) -> None:
     if path.is_dir():
         raise OutputError(f"'{path}' is a directory; name a file in it")
     if path.suffix.lower() not in suffixes:
@@ -74,7 +84,6 @@ def check_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str,
         raise OutputError(f"'{path}' exists; pass --force (force=True in Python) to replace it")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"cannot write '{path}': the folder '{folder}' may not be written to")
-    return path
 
 
 @contextmanager

@@ -11,11 +11,18 @@ import torch
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.blocks import BatchNorm, ContextNorm, GraphAttention, SubFieldPool
+from geomoe3d.filters.blocks import GraphAttention, SubFieldPool
 from geomoe3d.filters.counting import count_cost, num_parameters
 from geomoe3d.filters.geomoe import GeoMoE, find_neighbors
 from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.filters.moe import FMoE
+from geomoe3d.filters.norms import (
+    BatchNorm,
+    ContextNorm,
+    Pointwise,
+    frozen_statistics,
+    norm_relu_linear,
+)
 
 TINY = NetworkConfig(num_layers=2, width=16, num_sub_fields=6, num_heads=2, expert_width=4)
 
@@ -366,13 +373,42 @@ def test_neighbours_equal_brute_force_and_start_with_the_row_itself() -> None:
     assert torch.equal(few[:, 3:], torch.arange(3)[:, None].expand(3, 5))
 
 
-def test_activation_checkpointing_gives_the_same_gradients() -> None:
+@pytest.mark.parametrize("padded", [False, True])
+def test_activation_checkpointing_gives_the_same_gradients_and_statistics(padded: bool) -> None:
     x = sample(2, 30, 2)
-    grads = []
+    mask = torch.arange(30)[None] < torch.tensor([[30], [18]]) if padded else None
+    grads, stats = [], []
     for flag in (False, True):
         model = tiny().train()
         model.checkpoint_activations = flag
-        out = model(x)
+        out = model(x, mask=mask)
         (out.logits.square().sum() + out.balance).backward()
         grads.append(torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None]))
+        stats.append(torch.cat([b.flatten() for b in model.buffers()]))
     torch.testing.assert_close(*grads)
+    torch.testing.assert_close(*stats)
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 7), (1, 4, 5)])
+def test_recomputed_norm_relu_linear_equals_the_plain_chain(shape: tuple[int, int, int]) -> None:
+    torch.manual_seed(0)
+    norm, linear = BatchNorm(4).double().train(), Pointwise(4, 3).double()
+    with torch.no_grad():
+        norm.weight.copy_(torch.tensor([0.5, -1, 2, 1]))
+        norm.bias.copy_(torch.tensor([0.1, 0.2, -0.3, 0]))
+    x = torch.randn(shape, dtype=torch.float64, requires_grad=True)
+    inputs = (x, norm.weight, norm.bias, linear.weight, linear.bias)
+    plain = torch.nn.BatchNorm1d(4).double()
+    plain.load_state_dict(norm.state_dict())
+    expected = torch.nn.functional.conv1d(torch.relu(plain(x)), linear.weight, linear.bias)
+    got = norm_relu_linear(x, norm, linear)
+    torch.testing.assert_close(got, expected)
+    torch.testing.assert_close(norm.running_mean, plain.running_mean)
+    torch.testing.assert_close(norm.running_var, plain.running_var)
+    assert norm.num_batches_tracked == 1
+    before = norm.running_mean.clone()
+    with frozen_statistics():
+        torch.testing.assert_close(norm_relu_linear(x, norm, linear), expected)
+        norm(x)
+    assert torch.equal(norm.running_mean, before)
+    assert torch.autograd.gradcheck(lambda *_: norm_relu_linear(x, norm, linear), inputs)

@@ -8,65 +8,14 @@ All blocks are linear in N.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-import torch.nn.functional as F  # noqa: N812 - the field's name for it
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
+
+from geomoe3d.filters.norms import BatchNorm, ContextNorm, Pointwise, norm_relu_linear
 
 # Score of a key that the prior rejects: far below any real one, yet finite, so that a row in which every
 # key is rejected becomes uniform attention instead of NaN.
 REJECTED_SCORE = -1e6
-
-
-class Pointwise(nn.Conv1d):
-    """1x1 convolution: the same affine map of the channels at every place."""
-
-    def __init__(self, num_in: int, num_out: int) -> None:
-        super().__init__(num_in, num_out, kernel_size=1)
-
-
-class BatchNorm(nn.BatchNorm1d):
-    """Batch normalisation over (B, N) that leaves padding out of its statistics.
-
-    With a single value per channel in training (a pooled vector at batch size 1) there are no statistics
-    to take, so the running ones are used and left as they are.
-    """
-
-    def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, C, N) to the same shape."""
-        if not self.training or x.shape[0] * x.shape[2] == 1:
-            return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
-        if mask is None:
-            normed: Tensor = super().forward(x)
-            return normed
-        normed, mean, variance = _normalize(x, mask, (0, 2), self.eps)
-        self._track(mean.flatten(), variance.flatten(), mask.sum())
-        return normed * self.weight[:, None].to(x.dtype) + self.bias[:, None].to(x.dtype)
-
-    @torch.no_grad()
-    def _track(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
-        assert self.running_mean is not None
-        assert self.running_var is not None
-        assert self.num_batches_tracked is not None
-        momentum = self.momentum or 0.0
-        unbiased = variance * (count / (count - 1).clamp(min=1))
-        self.running_mean.lerp_(mean.to(self.running_mean.dtype), momentum)
-        self.running_var.lerp_(unbiased.to(self.running_var.dtype), momentum)
-        self.num_batches_tracked.add_(1)
-
-
-class ContextNorm(nn.Module):
-    """Each pair's channels to zero mean and unit (biased) variance over its own correspondences."""
-
-    eps = 1e-3
-
-    def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, C, N) to the same shape."""
-        if mask is None:
-            return F.instance_norm(x, eps=self.eps)
-        return _normalize(x, mask, (2,), self.eps)[0]
 
 
 class PointCN(nn.Module):
@@ -87,9 +36,8 @@ class PointCN(nn.Module):
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, C, N) to the same shape."""
         h = x if self.context_norm1 is None else self.context_norm1(x, mask)
-        h = self.linear1(F.relu(self.norm1(h, mask)))
-        h = F.relu(self.norm2(self.context_norm2(h, mask), mask))
-        return torch.add(x, self.linear2(h))
+        h = norm_relu_linear(h, self.norm1, self.linear1, mask)
+        return x + norm_relu_linear(self.context_norm2(h, mask), self.norm2, self.linear2, mask)
 
 
 class TwoLayer(nn.Module):
@@ -103,7 +51,7 @@ class TwoLayer(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, num_in, N) to (B, num_out, N)."""
-        return self.linear2(F.relu(self.norm(self.linear1(x), mask)))  # type: ignore[no-any-return]
+        return norm_relu_linear(self.linear1(x), self.norm, self.linear2, mask)
 
 
 class GraphAttention(nn.Module):
@@ -119,7 +67,9 @@ class GraphAttention(nn.Module):
         super().__init__()
         self.num_heads = num_heads
         self.query = Pointwise(width, width)
-        self.key_value = Pointwise(width, 2 * width)
+        # Apart, since halves of one product are no views that a batched product can use without a copy.
+        self.key = Pointwise(width, width)
+        self.value = Pointwise(width, width)
         self.message = Pointwise(width, width)
         self.update = TwoLayer(2 * width, 2 * width, width)
 
@@ -144,9 +94,13 @@ class GraphAttention(nn.Module):
         Returns:
             The updated a (B, C, N), and the attention (B, heads, N, M), rows summing to one.
         """
-        q = self._heads(self.query(a))
-        k, v = (self._heads(x) for x in self.key_value(b).chunk(2, dim=1))
-        scores = (q * q.shape[2] ** -0.5).transpose(2, 3) @ k
+        q, k, v = self._heads(self.query(a)), self._heads(self.key(b)), self._heads(self.value(b))
+        scale = q.shape[2] ** -0.5
+        if a.shape[2] < b.shape[2]:  # scale the smaller side: the result is kept for the backward pass
+            q = q * scale
+        else:
+            k = k * scale
+        scores = q.transpose(2, 3) @ k
         if b_kept is not None:
             scores = scores.masked_fill(~b_kept[:, None], REJECTED_SCORE)
         if b_mask is not None:
@@ -173,44 +127,8 @@ class SubFieldPool(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(B, C, N) to sub-fields (B, C, M) and their weights S (B, M, N)."""
-        scores = self.linear(F.relu(self.norm(self.context_norm(x, mask), mask)))
+        scores = norm_relu_linear(self.context_norm(x, mask), self.norm, self.linear, mask)
         if mask is not None:
             scores = scores.masked_fill(~mask, -torch.inf)
         weights = scores.softmax(dim=2)
         return x @ weights.transpose(1, 2), weights
-
-
-def _normalize(x: Tensor, mask: Tensor, dims: tuple[int, ...], eps: float) -> tuple[Tensor, Tensor, Tensor]:
-    result: tuple[Tensor, Tensor, Tensor] = _MaskedNormalize.apply(x, mask, dims, eps)  # type: ignore[no-untyped-call]
-    return result
-
-
-class _MaskedNormalize(torch.autograd.Function):
-    """(x - mean) / sqrt(var + eps) over ``dims`` of the unmasked entries, 0 elsewhere; saves one tensor."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, mask: Tensor, dims: tuple[int, ...], eps: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        wide = x.float() if x.dtype in (torch.bfloat16, torch.float16) else x
-        share = mask.to(wide.dtype)
-        count = share.sum(dims, keepdim=True).clamp(min=1)
-        mean = (wide * share).sum(dims, keepdim=True) / count
-        centred = (wide - mean) * share
-        variance = centred.square().sum(dims, keepdim=True) / count
-        inverse = torch.rsqrt(variance + eps)
-        normed = (centred * inverse).to(x.dtype)
-        ctx.dims = dims
-        ctx.save_for_backward(normed, inverse, share, count)
-        ctx.mark_non_differentiable(mean, variance)
-        return normed, mean, variance
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
-        normed, inverse, share, count = ctx.saved_tensors
-        gradient = gradients[0].to(share.dtype) * share
-        mean = gradient.sum(ctx.dims, keepdim=True) / count
-        slope = (gradient * normed).sum(ctx.dims, keepdim=True) / count
-        result = inverse * (gradient - mean - normed * slope) * share
-        return result.to(normed.dtype), None, None, None

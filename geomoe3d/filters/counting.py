@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from geomoe3d.filters.blocks import BatchNorm, ContextNorm, GraphAttention, Pointwise, SubFieldPool
+from geomoe3d.filters.blocks import GraphAttention, SubFieldPool
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.layers import ChannelPath
 from geomoe3d.filters.moe import FMoE
+from geomoe3d.filters.norms import BatchNorm, ContextNorm, Pointwise
 
 
 class Cost(NamedTuple):

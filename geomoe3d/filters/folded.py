@@ -175,12 +175,13 @@ class _Gather:
         self.prior = module.prior
         self.heads = block.num_heads
         width = block.query.in_channels
-        key_value, bias = affine(block.key_value)
         scale = (width // self.heads) ** -0.5
         self.query, self.query_bias = (x * scale for x in affine(block.query))
-        self.key = key_value[:width].reshape(self.heads, -1, width).contiguous()
-        self.value = key_value[width:].reshape(self.heads, -1, width).contiguous()
-        self.update = FoldedUpdate(block, bias[width:])
+        # A key's bias adds the same to every score of a query, which the softmax cancels.
+        self.key = affine(block.key)[0].reshape(self.heads, -1, width)
+        value, value_bias = affine(block.value)
+        self.value = value.reshape(self.heads, -1, width)
+        self.update = FoldedUpdate(block, value_bias)
 
     def __call__(self, z: Tensor, field: Tensor, logits: Tensor | None) -> Tensor:
         width, num_fields = z.shape
@@ -207,12 +208,12 @@ class _Rebuild:
     def __init__(self, block: GraphAttention) -> None:
         self.heads = block.num_heads
         width = block.query.in_channels
-        key_value, bias = affine(block.key_value)
         query, query_bias = affine(block.query)
         scale = (width // self.heads) ** -0.5
         self.query = (query * scale).reshape(self.heads, -1, width)
         self.query_bias = (query_bias * scale).reshape(self.heads, -1, 1)
-        self.key_value, self.value_bias = key_value, bias[width:]
+        value, self.value_bias = affine(block.value)
+        self.key_value = torch.cat([affine(block.key)[0], value])
         first, first_bias, self.second, self.second_bias = two_layer(block.update)
         message, message_bias = affine(block.message)
         self.own = first[:, :width].contiguous()

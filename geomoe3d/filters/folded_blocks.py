@@ -9,9 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from geomoe3d.filters.blocks import BatchNorm, ContextNorm, GraphAttention, TwoLayer
+from geomoe3d.filters.blocks import GraphAttention, TwoLayer
 from geomoe3d.filters.layers import BiPathRectifier, ChannelPath, FeedForward
 from geomoe3d.filters.moe import DenseFeedForward, FMoE, expert_weights
+from geomoe3d.filters.norms import BatchNorm, ContextNorm
 
 
 def affine(module: torch.nn.Conv1d) -> tuple[Tensor, Tensor]:
@@ -54,12 +55,13 @@ class FoldedAmong:
     def __init__(self, block: GraphAttention) -> None:
         self.heads = block.num_heads
         width = block.query.in_channels
-        key_value, bias = affine(block.key_value)
+        key, key_bias = affine(block.key)
+        value, value_bias = affine(block.value)
         query, query_bias = affine(block.query)
         scale = (width // self.heads) ** -0.5
-        self.all = torch.cat([query * scale, key_value])
-        self.all_bias = torch.cat([query_bias * scale, bias[:width], torch.zeros_like(bias[width:])])
-        self.update = FoldedUpdate(block, bias[width:])
+        self.all = torch.cat([query * scale, key, value])
+        self.all_bias = torch.cat([query_bias * scale, key_bias, torch.zeros_like(value_bias)])
+        self.update = FoldedUpdate(block, value_bias)
 
     def __call__(self, z: Tensor) -> Tensor:
         """Sub-fields (C, M) to the same shape."""

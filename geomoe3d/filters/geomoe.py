@@ -12,6 +12,7 @@ the paper, and where its text and released code differ `NetworkConfig` has a swi
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,7 @@ from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.layers import GeoMoELayer, MotionInitialisation, motion
 from geomoe3d.filters.moe import Routing
 from geomoe3d.filters.neighbors import nearest_neighbors
+from geomoe3d.filters.norms import frozen_statistics
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,15 @@ class GeoMoE(nn.Module):
         verdicts, routings, insights = [], [], []
         for layer in self.layers:
             if self.checkpoint_activations and self.training:
-                step = checkpoint(layer, field, logits, neighbors, wide_mask, use_reentrant=False)
+                step = checkpoint(
+                    layer,
+                    field,
+                    logits,
+                    neighbors,
+                    wide_mask,
+                    use_reentrant=False,
+                    context_fn=lambda: (nullcontext(), frozen_statistics()),
+                )
             else:
                 step = layer(field, logits, neighbors, wide_mask)
             field, logits, attention, routing = step

@@ -14,8 +14,9 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.blocks import BatchNorm, GraphAttention, PointCN, Pointwise, SubFieldPool, TwoLayer
+from geomoe3d.filters.blocks import GraphAttention, PointCN, SubFieldPool, TwoLayer
 from geomoe3d.filters.moe import DenseFeedForward, FMoE, Routing
+from geomoe3d.filters.norms import BatchNorm, Pointwise, norm_relu_linear
 
 
 def weights_from_logits(logits: Tensor) -> Tensor:
@@ -193,7 +194,7 @@ class InlierPredictor(nn.Module):
 
     def forward(self, field: Tensor, mask: Tensor | None) -> Tensor:
         """(B, D, N) to logits (B, N), at least float32, 0 at padding."""
-        logits: Tensor = self.linear(F.relu(self.norm(field, mask)))[:, 0]
+        logits = norm_relu_linear(field, self.norm, self.linear, mask)[:, 0]
         logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
         return logits if mask is None else logits.masked_fill(~mask[:, 0], 0.0)
 

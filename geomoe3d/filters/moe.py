@@ -13,7 +13,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from geomoe3d.filters.blocks import Pointwise, TwoLayer
+from geomoe3d.filters.blocks import TwoLayer
+from geomoe3d.filters.norms import Pointwise
 
 
 class Routing(NamedTuple):

@@ -122,6 +122,7 @@ class TrainingRun:
             self.model.parameters(),
             lr=config.optimizer.learning_rate,
             weight_decay=config.optimizer.weight_decay,
+            fused=True,
         )
         self.progress = _Progress()
         if self.last_path.exists():

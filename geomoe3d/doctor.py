@@ -52,6 +52,7 @@ REQUIRED_MODULES = {
     "yaml": "pyyaml>=6.0",
     "click": "click>=8.1",
     "rich": "rich>=13.7",
+    "safetensors": "safetensors>=0.4.3",
     "matplotlib": "matplotlib>=3.8",
     "trimesh": "trimesh>=4.4",
     "small_gicp": "small_gicp>=1.0",
@@ -61,6 +62,7 @@ REQUIRED_MODULES = {
 OPTIONAL_MODULES = {
     "lazrs": ("laspy[lazrs]>=2.5", "LAS and LAZ files"),
     "pye57": ("pye57>=0.4.11", "E57 files"),
+    "tensorboard": ("tensorboard>=2.16", "curves of a training run in TensorBoard"),
     "kiss_matcher": ("kiss-matcher>=1.0", "comparison with KISS-Matcher"),
 }
 """Module to import, what to ask pip for, and what it is good for."""

@@ -66,7 +66,7 @@ def test_filter_gives_the_networks_own_verdict(changes: dict[str, object]) -> No
     assert out.weights.dtype == np.float64
     assert out.groups is not None
     assert set(np.unique(out.groups)) <= {0, 1, 2, 3}
-    assert out.group_names == ("expert 1", "expert 2", "expert 3", "expert 4")
+    assert out.group_names == ("expert 1", "expert 2", "expert 3", "expert 4", "not seen")
 
 
 def test_bad_rows_get_no_weight_and_do_not_disturb_the_others() -> None:
@@ -81,7 +81,7 @@ def test_bad_rows_get_no_weight_and_do_not_disturb_the_others() -> None:
     assert clean.logits is not None
     np.testing.assert_allclose(dirty.logits[~bad], clean.logits, atol=1e-5)
     assert dirty.groups is not None
-    assert (dirty.groups[bad] == -1).all()
+    assert {dirty.group_names[g] for g in dirty.groups[bad]} == {"not seen"}
 
 
 @pytest.mark.parametrize("num", [0, 1, 2])

@@ -83,8 +83,8 @@ class GeoMoEFilter:
         return FilterOutput(
             weights=weights,
             logits=np.nan_to_num(logits, nan=-np.inf),
-            groups=insight.expert if experts else None,
-            group_names=tuple(f"expert {i + 1}" for i in range(experts)),
+            groups=np.where(insight.expert < 0, experts, insight.expert) if experts else None,
+            group_names=(*(f"expert {i + 1}" for i in range(experts)), "not seen") if experts else (),
         )
 
     def look(self, correspondences: Correspondences, *, voxel_size: float) -> Insight:

@@ -15,6 +15,7 @@ from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
 
 if TYPE_CHECKING:
     from geomoe3d.data.check import CheckReport
+    from geomoe3d.types import FloatArray
 
 
 @click.group(context_settings=HELP)
@@ -101,3 +102,88 @@ def _lines(unit: str) -> Callable[[int, int], None]:
         click.echo(f"{done} of {total} {unit}{left}", err=True)
 
     return say
+
+
+@command.command(context_settings=HELP)
+@click.argument("frames", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--count", default=50, show_default=True, help="Frames fused into one fragment.")
+@click.option("--voxel", default=0.006, show_default=True, help="Edge of the fusion grid, metres.")
+@click.option("--max-depth", default=6.0, show_default=True, help="Depth beyond it is not used, metres.")
+@click.option(
+    "--whole", is_flag=True, help="Keep what lies outside the cube of 3 m to which 3DMatch cut its fragments."
+)
+@click.option("--grid", type=float, help="Keep one point per cell of this edge, metres (default: all).")
+@click.option("--min-overlap", default=0.1, show_default=True, help="Least overlap of a pair in gt.log.")
+@click.option("--convention", type=click.Choice(("7scenes", "tum", "plain")), help="Default: look at FRAMES.")
+@click.option("--intrinsics", metavar="FX,FY,CX,CY", help="Pixels (default: the folder's file).")
+@click.option("--depth-unit", type=float, help="Depth values per metre (default: 1000, TUM 5000).")
+@click.option(
+    "--invalid",
+    type=int,
+    multiple=True,
+    help="Depth value that means none (default: 0 and 65535); repeatable.",
+)
+@traceback_option
+def fragments(
+    frames: str,
+    out: str,
+    count: int,
+    voxel: float,
+    max_depth: float,
+    whole: bool,
+    grid: float | None,
+    min_overlap: float,
+    convention: str | None,
+    intrinsics: str | None,
+    depth_unit: float | None,
+    invalid: tuple[int, ...],
+) -> None:
+    """Fuse the depth FRAMES of a folder into fragments with ground truth, into the new folder OUT.
+
+    FRAMES holds frame-*.depth.png with *.pose.txt (7-Scenes, 3DMatch), depth.txt with groundtruth.txt (TUM),
+    or depth/*.png with poses.txt. Poses are camera to world. Unusable frames are named and skipped.
+    """
+    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.data.fragments import make_fragments
+    from geomoe3d.data.fusion import THREEDMATCH_VOLUME, FusionSettings
+    from geomoe3d.data.rgbd import open_recording
+
+    with stdout_to_stderr(), progress_bar("fragments", quiet=False) as advance:
+        recording = open_recording(
+            frames,
+            convention=convention,
+            intrinsics=None if intrinsics is None else _intrinsics(intrinsics),
+            per_metre=depth_unit,
+            invalid=invalid or (0, 65535),
+        )
+        report = make_fragments(
+            recording,
+            out,
+            frames_per_fragment=count,
+            settings=FusionSettings(
+                voxel_size=voxel,
+                truncation=5 * voxel,
+                max_depth=max_depth,
+                volume=None if whole else THREEDMATCH_VOLUME,
+            ),
+            min_overlap=min_overlap,
+            grid=grid,
+            progress=advance,
+        )
+    for line in report.skipped:
+        click.echo(f"skipped: {line}", err=True)
+    points = ", ".join(str(number) for number in report.num_points)
+    click.echo(
+        f"{len(report.num_points)} fragments ({points} points), {report.num_pairs} pairs in {out}/gt.log"
+    )
+
+
+def _intrinsics(text: str) -> FloatArray:
+    import numpy as np
+
+    try:
+        fx, fy, cx, cy = (float(word) for word in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"'{text}' is not four numbers fx,fy,cx,cy") from None
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

@@ -37,7 +37,7 @@ class BenchmarkPair:
         source: path of fragment i; it need not exist where only the ground truth is at hand.
         target: path of fragment j.
         T_target_source: (4, 4), p_target = R p_source + t, metres.
-        overlap: share of the smaller side's points with a neighbour, as published, or None where not listed.
+        overlap: share of the source's points with a target neighbour, as published, or None if not listed.
         information: (6, 6) matrix of gt.info that weighs the benchmark's RMSE, or None where not listed.
     """
 

@@ -53,7 +53,7 @@ class MatchingConfig(Section):
     neighbors: int = Field(1, ge=1, le=10, description="targets kept per source point")
     max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by method ratio")
     max_correspondences: int = Field(
-        5000, ge=3, description="at most so many correspondences are used, those with the best ratio"
+        2000, ge=3, description="at most so many are used: mutual ones first, then a seeded choice"
     )
 
 
@@ -72,7 +72,11 @@ class EstimatorConfig(Section):
         "fit, for correspondences that are nearly all right",
     )
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
-    num_hypotheses: int = Field(8, ge=1, description="distinct hypotheses kept")
+    num_hypotheses: int = Field(15, ge=1, description="distinct hypotheses kept by each round")
+    one_way_weight: float = Field(
+        0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"
+    )
+    mutual_round: bool = Field(True, description="a second round proposes from the mutual matches alone")
     ransac_iterations: int = Field(50_000, ge=1, description="most samples drawn by ransac")
     ransac_confidence: float = Field(
         0.999, gt=0, lt=1, description="ransac stops when this sure that it has drawn a clean sample"
@@ -89,7 +93,7 @@ class RefinementConfig(Section):
     """Local refinement of the chosen hypothesis on the clouds."""
 
     method: Literal["none", "icp", "gicp"] = Field("icp", description="how the chosen motion is polished")
-    max_distance: float = Field(1.0, gt=0, description="largest distance of matched points, in voxels")
+    max_distance: float = Field(1.5, gt=0, description="largest distance of matched points, in voxels")
     max_iterations: int = Field(30, ge=1, description="most steps of the refinement")
 
 

@@ -119,7 +119,9 @@ class RegistrationResult:
         from geomoe3d.geometry.se3 import transform_points
 
         if not np.isfinite(self.T_target_source).all():
-            raise InputError(f"this result holds no transform (status {self.status}: {'; '.join(self.reasons)})")
+            raise InputError(
+                f"this result holds no transform (status {self.status}: {'; '.join(self.reasons)})"
+            )
         array = np.asarray(points, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != 3:
             raise InputError(f"points must have shape (N, 3), found {array.shape}")

@@ -15,13 +15,16 @@ from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, P
 _BLOCK_ENTRIES = 12_000_000
 
 
-def match(source: PreparedCloud, target: PreparedCloud, config: MatchingConfig) -> Correspondences:
+def match(
+    source: PreparedCloud, target: PreparedCloud, config: MatchingConfig, *, seed: int = 0
+) -> Correspondences:
     """Putative correspondences between two described clouds.
 
     Methods: ``one_way`` keeps for every source point its nearest targets; ``mutual`` of these only pairs
     that are each other's nearest; ``ratio`` only pairs whose distance is at most ``max_ratio`` of the
-    second best. At most ``max_correspondences`` are kept: those with the smallest ratio, that is the most
-    distinctive, in source order.
+    second best. At most ``max_correspondences`` are kept, in source order: mutual ones first, filled up by a
+    seeded random choice of the others. (The most distinctive by ratio crowd on a few objects and fix the
+    motion less well than random ones do.)
 
     Raises:
         InputError: a cloud without features.
@@ -45,10 +48,11 @@ def match(source: PreparedCloud, target: PreparedCloud, config: MatchingConfig) 
         ratio.ravel(),
         mutual,
     ).take(keep)
-    if len(found) <= config.max_correspondences or found.ratio is None:
+    if len(found) <= config.max_correspondences:
         return found
-    best = np.argsort(found.ratio, kind="stable")[: config.max_correspondences]
-    return found.take(np.sort(best))
+    shuffled = np.random.default_rng(seed).permutation(len(found))
+    mutual_first = np.argsort(~mutual[keep][shuffled], kind="stable")
+    return found.take(np.sort(shuffled[mutual_first[: config.max_correspondences]]))
 
 
 def nearest_features(

@@ -15,6 +15,7 @@ from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _AUTO_SAMPLE = 200_000  # points looked at when a voxel size is chosen: density is known well enough by then
 _MIN_POINTS = 3
+_MAX_EXTENT_RATIO = 50
 
 
 def prepare(
@@ -84,7 +85,7 @@ def choose_voxel_size(source: PointCloud, target: PointCloud, num_points: int) -
     for cloud in (source, target):
         if len(cloud) < _MIN_POINTS:
             raise EmptyCloudError(
-                f"'{cloud.name}' holds {len(cloud)} points, at least {_MIN_POINTS} are needed to fix a rigid motion"
+                f"'{cloud.name}' holds {len(cloud)} points; a rigid motion needs at least {_MIN_POINTS}"
             )
         if not np.ptp(cloud.points, axis=0).any():
             raise EmptyCloudError(
@@ -94,6 +95,22 @@ def choose_voxel_size(source: PointCloud, target: PointCloud, num_points: int) -
     by_count = max(_size_for_count(_thin(c.points), num_points) for c in (source, target))
     by_spacing = 2.0 * max(typical_spacing(c.points) for c in (source, target))
     return float(f"{max(by_count, by_spacing):.2g}")
+
+
+def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
+    """A sentence where two extents differ so much that the units must differ, else None.
+
+    A factor of 50 is far beyond partial overlap of two scans, and far below millimetres against metres.
+    """
+    extents = [float(np.linalg.norm(np.ptp(cloud.points, axis=0))) for cloud in (source, target)]
+    small, large = sorted(extents)
+    if small <= 0 or large / small < _MAX_EXTENT_RATIO:
+        return None
+    return (
+        f"the extents differ by a factor of {large / small:.0f} ('{source.name}' {extents[0]:.4g}, "
+        f"'{target.name}' {extents[1]:.4g}; at most {_MAX_EXTENT_RATIO} is taken): one is probably in "
+        "millimetres and the other in metres; bring both to one unit, a rigid motion cannot change scale"
+    )
 
 
 def _thin(points: FloatArray) -> FloatArray:
@@ -123,7 +140,7 @@ def typical_spacing(points: FloatArray) -> float:
 
     queries = points[:: max(1, len(points) // 2000)]
     distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(queries, k=2)
-    return float(np.median(distances[:, 1]))
+    return float(np.median(np.asarray(distances)[:, 1]))
 
 
 def drop_duplicates(points: FloatArray) -> tuple[FloatArray, int]:
@@ -179,7 +196,7 @@ def drop_isolated(points: FloatArray, radius: float) -> FloatArray:
     if len(points) < 3:
         return points[:0]
     distances, _ = cKDTree(points).query(points, k=3)
-    kept: FloatArray = points[distances[:, 2] <= radius]
+    kept: FloatArray = points[np.asarray(distances)[:, 2] <= radius]
     return kept
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from geomoe3d.types import FloatArray
 
 
-def make_transform(R: FloatArray, t: FloatArray) -> FloatArray:
+def make_transform(R: NDArray[np.floating[Any]], t: NDArray[np.floating[Any]]) -> FloatArray:
     """(..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3] = R
@@ -55,6 +58,6 @@ def project_to_so3(R: FloatArray) -> FloatArray:
 
 def shift_frames(T_local: FloatArray, source_origin: FloatArray, target_origin: FloatArray) -> FloatArray:
     """A motion between local frames, expressed between the file frames (file = local + origin)."""
-    T = T_local.copy()
+    T: FloatArray = T_local.copy()
     T[:3, 3] = T_local[:3, 3] + target_origin - T_local[:3, :3] @ source_origin
     return T

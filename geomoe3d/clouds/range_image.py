@@ -1,0 +1,85 @@
+"""What a sensor saw along each direction: the nearest surface, and so the space that must be free.
+
+Place: used by verification. A spherical image of about 2.5 degrees per pixel around the sensor; O(N) to
+build and to ask. Fused scans were seen from several places near the sensor, so the nearest surface in a
+3 x 3 neighbourhood counts, and a margin is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomoe3d.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """Nearest range per direction around one sensor.
+
+    Attributes:
+        viewpoint: (3,) sensor position.
+        axes: (3, 3) rows forward, left, up; up is a direction in which the cloud has no points if it can.
+        nearest: (rows, columns) smallest range in the 3 x 3 pixels around, infinite where nothing was seen.
+        seen: (rows, columns) True where the pixel itself holds a point.
+    """
+
+    viewpoint: FloatArray
+    axes: FloatArray
+    nearest: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, points: FloatArray, viewpoint: FloatArray, pixel_deg: float = 2.5) -> RangeImage:
+        """The range image of points (N, 3) seen from ``viewpoint`` (3,), same frame."""
+        columns = round(360 / pixel_deg)
+        shape = (columns // 2, columns)
+        axes = _viewing_axes(points - viewpoint)
+        row, column, distance = _pixels(points, viewpoint, axes, shape)
+        nearest = np.full(shape, np.inf)
+        np.minimum.at(nearest, (row, column), distance)
+        seen = np.isfinite(nearest)
+        around = np.minimum(nearest, np.minimum(np.roll(nearest, 1, 1), np.roll(nearest, -1, 1)))
+        padded = np.pad(around, ((1, 1), (0, 0)), constant_values=np.inf)
+        around = np.minimum(around, np.minimum(padded[:-2], padded[2:]))
+        return cls(viewpoint, axes, around, seen)
+
+    def look_at(self, points: FloatArray, margin: float) -> tuple[int, int]:
+        """How many points fall where the sensor saw something, and how many of them in front of it.
+
+        Args:
+            points: (N, 3) points that are claimed to exist.
+            margin: a point counts as in front when it is nearer than the surface seen by more than this.
+
+        Returns:
+            (number in seen directions, number of these that lie in space which the sensor saw through).
+        """
+        row, column, distance = _pixels(points, self.viewpoint, self.axes, self.seen.shape)
+        seen = self.seen[row, column]
+        through = seen & (distance < self.nearest[row, column] - margin)
+        return int(seen.sum()), int(through.sum())
+
+
+def _viewing_axes(rays: FloatArray) -> FloatArray:
+    """Forward is the mean direction: the poles, where pixels crowd, then lie at the side of the view."""
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+    forward = (rays / np.maximum(lengths, 1e-12)).mean(0)
+    norm = np.linalg.norm(forward)
+    forward = forward / norm if norm > 1e-6 else np.array([1.0, 0.0, 0.0])
+    helper = np.eye(3)[np.argmin(np.abs(forward))]
+    left = np.cross(helper, forward)
+    left /= np.linalg.norm(left)
+    return np.array([forward, left, np.cross(forward, left)])
+
+
+def _pixels(
+    points: FloatArray, viewpoint: FloatArray, axes: FloatArray, shape: tuple[int, ...]
+) -> tuple[IntArray, IntArray, FloatArray]:
+    rays = (points - viewpoint) @ axes.T
+    distance = np.sqrt(np.einsum("ij,ij->i", rays, rays))
+    azimuth = np.arctan2(rays[:, 1], rays[:, 0]) / (2 * np.pi) + 0.5
+    polar = np.arccos(np.clip(rays[:, 2] / np.maximum(distance, 1e-12), -1, 1)) / np.pi
+    row = np.minimum((polar * shape[0]).astype(np.int64), shape[0] - 1)
+    column = np.minimum((azimuth * shape[1]).astype(np.int64), shape[1] - 1)
+    return row, column, distance

@@ -1,0 +1,145 @@
+"""How sure: status, reasons and confidence from the evidence, and the information of the fit.
+
+Place: judge, the last step. The confidence is a documented score, not yet a calibrated probability: a
+logistic function of the evidence of the clouds and of its lead over the best clearly different motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomoe3d.config import JudgementConfig
+from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.result import Status
+from geomoe3d.types import FloatArray, PreparedCloud
+from geomoe3d.verification import Evidence
+
+_MIDDLE_EVIDENCE = 0.03  # total evidence score at which the clouds alone leave it open
+_EVIDENCE_SLOPE = 2.0
+_LEAD_SLOPE = 1.5
+_MIDDLE_LEAD = 2.0  # a right answer is usually more than twice as good as the best other motion
+_LEAST_OBSERVABILITY = 0.005
+_LOW_OVERLAP = 0.1
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Status with its reasons, sentences, and the confidence in [0, 1]."""
+
+    status: Status
+    reasons: tuple[str, ...]
+    confidence: float
+
+
+@dataclass(frozen=True)
+class Information:
+    """How firmly the overlapping surfaces hold the motion.
+
+    Attributes:
+        matrix: (6, 6) sum of J^T J / variance, J = [(x - c) x n, n] per matched point: order [rotation
+            (rad), translation], target axes, about ``center``; 1 / cloud unit^2 where it applies.
+        center: (3,) centroid c of the matched points, target local coordinates.
+        observability: smallest eigenvalue of the same sum per point with lengths divided by the root mean
+            square radius; 1/3 would be held equally from all sides, 0 means that the source can slide.
+        num_matched: matched points.
+    """
+
+    matrix: FloatArray
+    center: FloatArray
+    observability: float
+    num_matched: int
+
+
+def measure_information(
+    T_target_source: FloatArray, source: PreparedCloud, target: PreparedCloud, threshold: float
+) -> Information:
+    """Point-to-plane information of a motion over source points within ``threshold`` of the target.
+
+    Returns NaN matrices and observability 0 for fewer than 6 matched points.
+    """
+    from scipy.spatial import cKDTree
+
+    moved = transform_points(T_target_source, source.points)
+    distance, nearest = cKDTree(target.points).query(moved, distance_upper_bound=threshold)
+    distance, nearest = np.asarray(distance), np.asarray(nearest)
+    hit = np.isfinite(distance)
+    if hit.sum() < 6:
+        return Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, int(hit.sum()))
+    points, normals = moved[hit], target.normals[nearest[hit]]
+    gaps = np.einsum("ij,ij->i", points - target.points[nearest[hit]], normals)
+    center = points.mean(0)
+    J = np.hstack([np.cross(points - center, normals), normals])
+    # Points on one voxel grid cannot be trusted below a tenth of its edge.
+    variance = max(float(np.mean(gaps**2)), (0.1 * source.voxel_size) ** 2)
+    radius = float(np.sqrt(np.mean(np.sum((points - center) ** 2, axis=1))))
+    scaled = J / np.array([radius] * 3 + [1.0] * 3)
+    smallest = float(np.linalg.eigvalsh(scaled.T @ scaled / len(points))[0])
+    return Information(J.T @ J / variance, center, max(smallest, 0.0), int(hit.sum()))
+
+
+def judge(
+    evidence: Evidence,
+    lead: float,
+    information: Information,
+    config: JudgementConfig,
+) -> Judgement:
+    """Decide whether an answer may be believed.
+
+    Args:
+        evidence: of the answer, after refinement.
+        lead: score of the answer over the score of the best clearly different motion; inf without one.
+        information: of the answer.
+        config: thresholds.
+
+    Returns:
+        ``ambiguous`` where another motion is about as good or the surfaces let the source slide,
+        ``low_confidence`` below the threshold, else ``ok``.
+    """
+    confidence = confidence_score(evidence.score, lead)
+    notes = []
+    if evidence.overlap < _LOW_OVERLAP:
+        notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
+    if evidence.free_space_violation > 0.1:
+        notes.append(
+            "parts lie where the other scan's sensor saw free space "
+            f"(rate {evidence.free_space_violation:.2f})"
+        )
+    if information.observability < _LEAST_OBSERVABILITY:
+        notes.append(
+            "the shared surface lets the source slide or turn along itself "
+            f"(observability {information.observability:.4f}, needs {_LEAST_OBSERVABILITY}): it is too "
+            "plain, like a single plane or cylinder"
+        )
+        return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
+    if lead < 1 / config.ambiguity_ratio:
+        notes.append(
+            f"a clearly different motion fits {100 / lead:.0f} % as well; see the alternative, the scans may "
+            "show repeated or symmetric structure"
+        )
+        if confidence >= config.min_confidence or evidence.score > _MIDDLE_EVIDENCE:
+            return Judgement("ambiguous", tuple(notes), min(confidence, 0.5))
+    if confidence < config.min_confidence:
+        notes.append(
+            f"confidence {confidence:.2f} is below {config.min_confidence:.2f}: the scans may not overlap, "
+            "or share too little distinctive surface"
+        )
+        return Judgement("low_confidence", tuple(notes), confidence)
+    return Judgement("ok", tuple(notes), confidence)
+
+
+def lead_over(evidence: Evidence, other: Evidence | None) -> float:
+    """Score of the answer over that of another motion; inf where the other has none."""
+    if other is None or other.score <= 0:
+        return float("inf") if evidence.score > 0 else 1.0
+    return evidence.score / other.score
+
+
+def confidence_score(score: float, lead: float) -> float:
+    """Logistic score in (0, 1) of the evidence and of its lead; rises with both."""
+    if score <= 0:
+        return 0.0
+    strength = _EVIDENCE_SLOPE * np.log(score / _MIDDLE_EVIDENCE)
+    margin = _LEAD_SLOPE * np.log(min(lead, 100.0) / _MIDDLE_LEAD)
+    return float(1 / (1 + np.exp(-(strength + margin))))

@@ -1,0 +1,214 @@
+"""The method on one screen: load, prepare, describe, match, weigh, solve, verify, refine, judge."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geomoe3d.answer import Findings, failed_result, finished_result
+from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.matching import match
+from geomoe3d.clouds.prepare import choose_voxel_size, find_viewpoints, prepare, scale_mismatch
+from geomoe3d.config import RegistrationConfig, build_config
+from geomoe3d.errors import InputError
+from geomoe3d.estimators.base import Estimator, make_estimator
+from geomoe3d.filters.base import Filter, FilterOutput, make_filter
+from geomoe3d.judge import judge, lead_over, measure_information
+from geomoe3d.refine import refine
+from geomoe3d.result import RegistrationResult
+from geomoe3d.stages import Progress, StageClock
+from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
+from geomoe3d.verification import Evidence, Verifier, clearly_different
+
+_KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A result with what led to it, for pictures and for curious users.
+
+    Attributes:
+        result: the answer.
+        source, target: the clouds as loaded, full resolution, local coordinates.
+        correspondences: what was given to the estimator, local coordinates; empty where it never came to it.
+        weighed: what the filter said of them, in the same order.
+        inliers: (K,) True where a correspondence agrees with the answer.
+    """
+
+    result: RegistrationResult
+    source: PointCloud
+    target: PointCloud
+    correspondences: Correspondences = field(default_factory=lambda: Correspondences(np.zeros((0, 6))))
+    weighed: FilterOutput = field(default_factory=lambda: FilterOutput(np.zeros(0)))
+    inliers: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+
+    @property
+    def weights(self) -> FloatArray:
+        """(K,) the filter's weights."""
+        return self.weighed.weights
+
+
+class Registrar:
+    """Registers pairs of clouds with one configuration; keep it to load weights only once.
+
+    Args:
+        config: complete configuration; None takes the defaults.
+
+    Raises:
+        ConfigError: an unknown filter or estimator.
+    """
+
+    def __init__(self, config: RegistrationConfig | None = None) -> None:
+        self.config = config or RegistrationConfig()
+        self._filter: Filter = make_filter(self.config.filter.name)
+        self._estimator: Estimator = make_estimator(self.config.estimator)
+
+    def register(self, source: Any, target: Any, *, progress: Progress | None = None) -> RegistrationResult:
+        """The rigid motion that lays source on target; see `geomoe3d.register`."""
+        return self.explain(source, target, progress=progress).result
+
+    def register_many(self, pairs: Iterable[tuple[Any, Any]]) -> Iterator[RegistrationResult]:
+        """One result per (source, target), in order, as they are finished."""
+        for source, target in pairs:
+            yield self.register(source, target)
+
+    def filter(self, correspondences: ArrayLike, *, voxel_size: float) -> FloatArray:
+        """Weights (N,) in [0, 1] for anybody's correspondences (N, 6) = [source xyz, target xyz].
+
+        Args:
+            correspondences: (N, 6) in one unit of length.
+            voxel_size: the scale of the points' noise, same unit: the grid they came from.
+
+        Raises:
+            InputError: wrong shape or non-finite numbers.
+        """
+        rows = np.asarray(correspondences, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != 6 or not np.isfinite(rows).all():
+            raise InputError(f"correspondences must be finite numbers of shape (N, 6), found {rows.shape}")
+        return self._filter(Correspondences(rows), voxel_size=voxel_size, seed=self.config.seed).weights
+
+    def explain(self, source: Any, target: Any, *, progress: Progress | None = None) -> Explanation:
+        """`register` with the correspondences and weights behind the answer."""
+        config, seed, clock = self.config, self.config.seed, StageClock(progress)
+        clock("load")
+        clouds = _load(source, "source", seed), _load(target, "target", seed)
+        mismatch = scale_mismatch(*clouds)
+        if mismatch is not None:
+            return Explanation(failed_result(clouds, mismatch, config, clock.stop()), *clouds)
+        clock("prepare")
+        voxel_size = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
+        threshold = config.estimator.inlier_threshold * voxel_size
+        prepared = self.prepare(*clouds, voxel_size)
+        clock("describe")
+        described = describe(prepared[0], config.preparation), describe(prepared[1], config.preparation)
+        clock("match")
+        matched = match(*described, config.matching, seed=seed)
+        clock("weigh")
+        weighed = self._filter(matched, voxel_size=voxel_size, seed=seed)
+        clock("solve")
+        hypotheses = self.solve(matched, weighed.weights, threshold)
+        clock("verify")
+        verifier = Verifier(*described, threshold, seed=seed)
+        ranked = verifier.rank(hypotheses)
+        clock("refine")
+        findings = self.settle(hypotheses, ranked, verifier, described, threshold)
+        result = finished_result(described, matched, findings, config, threshold, clock.stop())
+        inliers = findings.residuals(matched) < threshold
+        return Explanation(result, *clouds, matched, weighed, inliers)
+
+    def prepare(
+        self, source: PointCloud, target: PointCloud, voxel_size: float
+    ) -> tuple[PreparedCloud, PreparedCloud]:
+        """Both clouds on one voxel grid with normals turned by one rule."""
+        config = self.config.preparation
+        views = find_viewpoints(source, target, config.viewpoint)
+        made = [
+            prepare(cloud, voxel_size, config, viewpoint=view, seed=self.config.seed)
+            for cloud, view in zip((source, target), views, strict=True)
+        ]
+        return made[0], made[1]
+
+    def solve(self, matched: Correspondences, weights: FloatArray, threshold: float) -> list[Hypothesis]:
+        """Hypotheses from all weighted correspondences, and from the mutual ones alone.
+
+        The second round costs little and often holds the right motion where one-way matches drown it.
+        """
+        config, seed = self.config.estimator, self.config.seed
+        if matched.mutual is not None:
+            weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
+        found = self._estimator(matched.points, weights, inlier_threshold=threshold, seed=seed)
+        if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
+            rows = matched.mutual
+            found += self._estimator(
+                matched.points[rows], weights[rows], inlier_threshold=threshold, seed=seed
+            )
+        return found
+
+    def settle(
+        self,
+        hypotheses: list[Hypothesis],
+        ranked: list[tuple[Hypothesis, Evidence]],
+        verifier: Verifier,
+        described: tuple[PreparedCloud, PreparedCloud],
+        threshold: float,
+    ) -> Findings:
+        """Choose the best hypothesis, refine it and judge it against the best other one."""
+        if not ranked:
+            return Findings.nothing(
+                "no rigid motion brings three correspondences in general position together"
+            )
+        source, target = described
+        start = (ranked if self.config.verification.enabled else verifier.rank(hypotheses[:1]))[0][0]
+        T, note = refine(start.T_target_source, source, target, self.config.refinement)
+        evidence, unrefined = verifier.evidence(T), verifier.evidence(start.T_target_source)
+        if evidence.score < _KEPT_EVIDENCE * unrefined.score:
+            T, evidence = start.T_target_source, unrefined
+            note = "refinement made the clouds fit less well; the unrefined motion is given"
+        other = clearly_different(ranked, T, source, 3 * threshold)
+        lead = lead_over(evidence, other[1] if other else None)
+        information = measure_information(T, source, target, threshold)
+        judgement = judge(evidence, lead, information, self.config.judgement)
+        if note is not None:
+            judgement = replace(judgement, reasons=(*judgement.reasons, note))
+        return Findings(T, other[0] if other else None, lead, evidence, information, judgement)
+
+
+def register(
+    source: Any,
+    target: Any,
+    *,
+    config: RegistrationConfig | None = None,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> RegistrationResult:
+    """The rigid motion p_target = R p_source + t that lays source on target; no first guess is needed.
+
+    Args:
+        source: path, (N, 3) array or tensor, Open3D or trimesh cloud or mesh, or `PointCloud`.
+        target: likewise, in the same unit of length.
+        config: complete configuration; None takes the defaults.
+        progress: called with the name of each stage as it begins.
+        overrides: top-level configuration keys such as ``voxel_size=0.05`` or ``seed=1``.
+
+    Returns:
+        The answer with status, confidence and reasons; look at ``result.ok`` before using the transform.
+
+    Raises:
+        InputError: a cloud that cannot be read or has too few usable points.
+        ConfigError: an unknown or invalid override.
+    """
+    if overrides:
+        tree = (config or RegistrationConfig()).model_dump()
+        config = build_config(RegistrationConfig, {**tree, **overrides}, "register(...)")
+    return Registrar(config).register(source, target, progress=progress)
+
+
+def _load(data: Any, role: str, seed: int) -> PointCloud:
+    named = isinstance(data, (str, os.PathLike, PointCloud))
+    return load_points(data, seed=seed, name=None if named else role)

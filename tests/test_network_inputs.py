@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from geomoe3d.errors import InputError, NonFiniteError
 from geomoe3d.filters.architecture import NetworkConfig
@@ -182,6 +183,45 @@ def test_degenerate_sets_give_finite_inputs(config: NetworkConfig, kind: str) ->
     assert int(pair.neighbors.min()) >= 0
     assert int(pair.neighbors.max()) < len(points)
     assert pair.channels is None or torch.isfinite(pair.channels).all()
+
+
+class LargestTensor(TorchDispatchMode):
+    """Remembers the largest number of elements that any operation inside returned."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.numel = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        out = func(*args, **(kwargs or {}))
+        for x in out if isinstance(out, (tuple, list)) else [out]:
+            if isinstance(x, torch.Tensor) and not any(stride == 0 for stride in x.stride()):
+                self.numel = max(self.numel, x.numel())
+        return out
+
+
+@pytest.mark.parametrize("config", [FAITHFUL, STRONGER])
+def test_inputs_of_many_correspondences_never_make_an_n_by_n_table(config: NetworkConfig) -> None:
+    num = 3000
+    points, _ = scene(num, 300)
+    with LargestTensor() as seen:
+        pair = pair_input(points, 0.05, config)
+    assert pair.neighbors.shape == (num, 8)
+    assert seen.numel <= num * config.compatibility_anchors
+
+
+def test_forward_and_backward_never_make_an_n_by_n_tensor() -> None:
+    num = 2000
+    config = NetworkConfig(num_layers=1, width=16, num_sub_fields=6, num_heads=2, expert_width=4)
+    model = GeoMoE(config).train()
+    x = torch.randn(2, num, 6, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(2, num, dtype=torch.bool)
+    mask[1, 1500:] = False
+    for padding in (None, mask):
+        with LargestTensor() as seen:
+            model(x, mask=padding).logits.sum().backward()
+        # d' x K values per correspondence in the local context are the most.
+        assert seen.numel <= 2 * num * 8 * 8
 
 
 def test_wrong_input_is_named() -> None:

@@ -130,6 +130,36 @@ def test_finished_run_leaves_everything_that_was_promised(tmp_path: Path) -> Non
     assert json.loads(best["config"])["steps"] == 6
 
 
+def test_run_that_is_asked_to_stop_ends_after_its_step_with_a_checkpoint(tmp_path: Path) -> None:
+    class Stopper(Silent):
+        def stepped(self, step: int, measures: dict[str, float], pairs_per_s: float, skipped: int) -> None:
+            run.stop = step == 3
+
+    run = TrainingRun(config_of(), tmp_path)
+    summary = run.train(Stopper())
+    assert not summary.finished
+    assert summary.weights is None
+    assert load_checkpoint(tmp_path / "last.pt")["step"] == 3
+
+
+@pytest.mark.slow
+def test_tensorboard_gets_every_scalar_once(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = config_of(logging={"every": 2, "tensorboard": True})
+    TrainingRun(config, tmp_path).train(Silent(), until=4)
+    TrainingRun(config, tmp_path).train(Silent())
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    tags = events.Tags()["scalars"]
+    assert {"train/loss", "validation/registration_recall", "experts/layer2_moe2_entropy"} <= set(tags)
+    assert [event.step for event in events.Scalars("train/loss")] == [2, 4, 6]
+    rows = read_csv(tmp_path / "train.csv")
+    for event, row in zip(events.Scalars("train/loss"), rows, strict=True):
+        assert event.value == pytest.approx(float(row["loss"]), rel=1e-5)
+
+
 def test_going_on_with_other_settings_or_data_is_refused(tmp_path: Path) -> None:
     TrainingRun(config_of(), tmp_path).train(Silent(), until=2)
     with pytest.raises(CheckpointError, match=r"optimizer\.learning_rate"):

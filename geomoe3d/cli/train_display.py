@@ -30,6 +30,9 @@ class Display:
         self._means: dict[str, float] = {}
         self._validations: list[tuple[int, dict[str, float], bool]] = []
         self._printed = 0.0
+        self._begin, self._begin_step = 0.0, -1
+        self._now = 0.0
+        self._last = (0, 0.0, 0)
 
     def __enter__(self) -> Display:
         if not self._quiet and sys.stderr.isatty():
@@ -61,8 +64,9 @@ class Display:
             old = self._means.get(name, measures[name])
             self._means[name] = 0.95 * old + 0.05 * measures[name]
         self._pace(step)
+        self._last = (step, pairs_per_s, skipped)
         if self._live is not None:
-            self._live.update(self._panel(step, pairs_per_s, skipped))
+            self._live.update(self._panel(*self._last))
         elif time.monotonic() - self._printed > _PLAIN_EVERY_S:
             self._printed = time.monotonic()
             shown = "  ".join(f"{name} {value:.3f}" for name, value in self._means.items())
@@ -74,15 +78,16 @@ class Display:
     def validated(self, step: int, measures: dict[str, float], best: bool) -> None:
         """Show a validation."""
         self._validations.append((step, measures, best))
+        if self._live is not None:
+            self._live.update(self._panel(*self._last))
         if not self._quiet and self._live is None:
             shown = "  ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in measures.items())
             click.echo(f"validation at step {step}: {shown}{'  (best)' if best else ''}", err=True)
 
     def _pace(self, step: int) -> None:
-        now = time.monotonic()
-        if not hasattr(self, "_begin"):
-            self._begin, self._begin_step = now, step
-        self._now = now
+        self._now = time.monotonic()
+        if self._begin_step < 0:
+            self._begin, self._begin_step = self._now, step
 
     def _left(self, step: int) -> str:
         done = step - self._begin_step

@@ -73,6 +73,7 @@ def draw_curves(folder: Path) -> Path:
     """Draw losses, label measures, registration recall and expert usage of a run as ``curves.png``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     train = read_csv(folder / "train.csv")
     validation = read_csv(folder / "validation.csv")
@@ -85,6 +86,7 @@ def draw_curves(folder: Path) -> Path:
             if points:
                 axis.plot(*zip(*points, strict=True), style, label=name.replace("_", " "), lw=1.2, ms=3)
         axis.set_xlabel("step")
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.grid(alpha=0.3)
         if axis.lines:
             axis.legend(fontsize=8)

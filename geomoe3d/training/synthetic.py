@@ -1,8 +1,9 @@
 """Correspondence pairs made up on the fly, so that training runs with no data on disk at all.
 
-A box-shaped room with furniture boxes is sampled; true matches come from an overlap region with noise,
-wrong ones from what misleads real descriptors: any other surface point, another point of the same or a
-parallel surface, and whole groups that agree on another motion (repeated structure). No images, no
+A box-shaped room with furniture boxes is sampled. True matches come from an overlap region; as keypoints
+of two scans rarely coincide, they lie off along the surface, and some by a little too much to count as
+true. Wrong ones come from what misleads real descriptors: any other surface point, another point of the
+same or a parallel surface, and whole groups that agree on another motion (repeated structure). No images, no
 descriptors: a few milliseconds per pair, and the share of true matches is set, not met by chance.
 """
 
@@ -17,6 +18,14 @@ from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 _BASE_VOXEL = 0.05
+_RANGES = {
+    "correspondences": 3,
+    "inlier_ratio": 0,
+    "noise": 0,
+    "spread": 1e-3,
+    "near_misses": 0,
+    "voxel_size": 1e-9,
+}
 
 
 class SyntheticConfig(Section):
@@ -25,7 +34,14 @@ class SyntheticConfig(Section):
     num_pairs: int = Field(1 << 40, ge=1, description="distinct pairs; the default never repeats one")
     correspondences: tuple[int, int] = Field((1000, 1000), description="least and most per pair")
     inlier_ratio: tuple[float, float] = Field((0.005, 0.6), description="range, drawn log-uniformly")
-    noise: tuple[float, float] = Field((0.2, 0.8), description="standard deviation of true matches")
+    noise: tuple[float, float] = Field((0.1, 0.4), description="standard deviation of a matched point")
+    spread: tuple[float, float] = Field(
+        (0.5, 1.5),
+        description="how far along its surface a true match lies off, since sampled points rarely coincide",
+    )
+    near_misses: tuple[float, float] = Field(
+        (0.0, 1.5), description="matches off by a little too much to be true, per true match"
+    )
     inlier_threshold: float = Field(2.0, gt=0, description="residual below which a match is labelled true")
     structured_fraction: float = Field(
         0.3, ge=0, le=1, description="largest share of the wrong matches that agree on other motions"
@@ -37,7 +53,7 @@ class SyntheticConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> SyntheticConfig:
-        for name, least in (("correspondences", 3), ("inlier_ratio", 0), ("noise", 0), ("voxel_size", 1e-9)):
+        for name, least in _RANGES.items():
             low, high = getattr(self, name)
             if not least <= low <= high:
                 raise ValueError(f"{name} must be a range [low, high] with {least} <= low <= high")
@@ -63,20 +79,27 @@ class SyntheticPairs:
 
     def identity(self) -> str:
         """Seed and settings."""
-        return f"synthetic:1:{self.seed}:{self.config.model_dump_json()}"
+        return f"synthetic:2:{self.seed}:{self.config.model_dump_json()}"
 
 
 def generate_pair(rng: np.random.Generator, config: SyntheticConfig) -> TrainingPair:
     """One pair with about the drawn share of true matches (chance hits are labelled true as well)."""
     num = int(rng.integers(config.correspondences[0], config.correspondences[1] + 1))
     num_true = int(np.clip(round(num * _log_uniform(rng, config.inlier_ratio)), 1, num))
+    num_near = min(int(num_true * rng.uniform(*config.near_misses)), (num - num_true) // 2)
+    num_like = num_true + num_near
     room = _Room(rng)
     T = _random_motion(rng, 3.0)
     center, radius = rng.uniform(0, 1, 3) * room.size, float(rng.uniform(0.6, 3.0))
-    points, face = room.sample(rng, num, num_true, center, radius)
-    target = np.empty_like(points)
-    wrong = np.arange(num_true, num)
-    target[:num_true] = points[:num_true]
+    points, face = room.sample(rng, num, num_like, center, radius)
+    target = points.copy()
+    spread = rng.uniform(*config.spread)
+    off = np.concatenate([
+        _rayleigh(rng, spread, 0.9 * config.inlier_threshold, num_true),
+        1.1 * config.inlier_threshold + rng.exponential(3 * spread, num_near),
+    ])  # fmt: skip
+    target[:num_like] += room.along(rng, face[:num_like], off * _BASE_VOXEL)
+    wrong = np.arange(num_like, num)
     target[wrong] = _wrong_targets(rng, room, config, points[wrong], face[wrong])
     sigma = rng.uniform(*config.noise) * _BASE_VOXEL
     target = target + rng.normal(0, sigma, target.shape)
@@ -115,6 +138,13 @@ class _Room:
         a, b = rng.random((2, len(face), 1))
         points: FloatArray = self.corner[face] + a * self.u[face] + b * self.v[face]
         return points
+
+    def along(self, rng: np.random.Generator, face: IntArray, length: FloatArray) -> FloatArray:
+        """Steps of given lengths in random directions within the faces."""
+        angle = rng.uniform(0, 2 * np.pi, (len(face), 1))
+        u, v = (x[face] / np.linalg.norm(x[face], axis=1, keepdims=True) for x in (self.u, self.v))
+        steps: FloatArray = length[:, None] * (np.cos(angle) * u + np.sin(angle) * v)
+        return steps
 
     def sample(
         self, rng: np.random.Generator, num: int, num_region: int, center: FloatArray, radius: float
@@ -188,6 +218,13 @@ def _random_motion(rng: np.random.Generator, spread: float) -> FloatArray:
     T[:3, :3] = Rotation.from_quat(q).as_matrix()
     T[:3, 3] = rng.normal(0, spread, 3)
     return T
+
+
+def _rayleigh(rng: np.random.Generator, scale: float, limit: float, num: int) -> FloatArray:
+    """Lengths of plane Gaussian steps, below a limit."""
+    most = -np.expm1(-0.5 * (limit / scale) ** 2)
+    lengths: FloatArray = scale * np.sqrt(-2 * np.log1p(-rng.random(num) * most))
+    return lengths
 
 
 def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:

@@ -51,6 +51,7 @@ def make_result(**changes):
         "reasons": (),
         "confidence": 0.9731,
         "overlap": 0.561,
+        "evidence": {},
         "num_correspondences": 4321,
         "num_inliers": 1234,
         "inlier_threshold": 0.11,
@@ -98,8 +99,10 @@ class FakeRegistrar:
             source=PointCloud(points),
             target=PointCloud(moved - origin, origin=origin),
             correspondences=Correspondences(np.column_stack([points, moved - origin])),
-            weights=None,
+            weights=np.ones(50),
             inliers=np.ones(50, dtype=bool),
+            groups=None,
+            group_names=(),
         )
 
 
@@ -269,7 +272,12 @@ def test_matrix_on_screen_is_exact_enough_at_national_grid_coordinates():
 
 def test_no_transform_is_said_and_not_written(tmp_path, scans, fake, capsys):
     fake.answer = make_result(
-        status="failed", T_target_source=np.full((4, 4), np.nan), reasons=("No hypothesis.",), confidence=0.0
+        status="failed",
+        T_target_source=np.full((4, 4), np.nan),
+        reasons=("No hypothesis.",),
+        confidence=0.0,
+        voxel_size=np.nan,
+        inlier_threshold=np.nan,
     )
     outputs = [tmp_path / name for name in ("T.txt", "T2.npy", "moved.ply", "T.json")]
     code = call(
@@ -278,6 +286,7 @@ def test_no_transform_is_said_and_not_written(tmp_path, scans, fake, capsys):
     printed = capsys.readouterr()
     assert code == 3
     assert "no transform was found" in printed.out
+    assert "nan" not in printed.out
     assert "T.txt" in printed.err and "moved.ply" in printed.err
     assert call("register", *scans, "--output", outputs[1], "--quiet") == 3
     assert capsys.readouterr().out == ""
@@ -540,8 +549,8 @@ def test_the_sample_pair_end_to_end(pair, tmp_path):
     result = RegistrationResult.from_json(done.stdout)
     truth = np.loadtxt(pair.truth)
     assert result.ok
-    assert rotation_error_deg(result.T_target_source, truth) < 0.5
-    assert translation_error(result.T_target_source, truth) < 0.02
+    assert rotation_error_deg(result.T_target_source, truth) < 1.0
+    assert translation_error(result.T_target_source, truth) < 0.04  # under half a voxel
     np.testing.assert_array_equal(np.loadtxt(T_txt), result.T_target_source)
     from geomoe3d.clouds.io import load_points
 

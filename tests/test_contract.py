@@ -258,7 +258,7 @@ ORDER = [
     {"geometry", "result", "transform_files"},
     {"clouds"},
     {"filters", "estimators", "data"},
-    {"verification", "refine", "judge"},
+    {"verification", "refine", "judge", "plausibility", "answer", "stages"},
     {"registration"},
     {"evaluation", "training", "visual"},
     {"cli"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -32,12 +33,9 @@ def summary(result: RegistrationResult, inverted: bool = False) -> str:
         + f": {_MEANING[result.status]} (confidence {result.confidence:.2f})",
         *(f"  {reason}" for reason in result.reasons),
         "",
-        _row("overlap", f"{result.overlap:.0%} of the source lies on the target"),
-        _row("inliers", _inliers(result)),
-        _row("voxel size", f"{result.voxel_size:.6g}{_chosen(result)}"),
+        *_found(result),
         _row("source", _cloud(first)),
         _row("target", _cloud(second)),
-        _row("alternative", _alternative(result)),
         _row("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in result.seconds.items())),
         "",
         direction(result, inverted),
@@ -68,6 +66,18 @@ def matrix_text(T: FloatArray) -> str:
 
 def _row(name: str, text: str) -> str:
     return f"{name:12}{text}"
+
+
+def _found(result: RegistrationResult) -> list[str]:
+    """The rows of what was measured; none where a pair was given up before."""
+    if not math.isfinite(result.voxel_size):
+        return []
+    return [
+        _row("overlap", f"{result.overlap:.0%} of the source lies on the target"),
+        _row("inliers", _inliers(result)),
+        _row("alternative", _alternative(result)),
+        _row("voxel size", f"{result.voxel_size:.6g}{_chosen(result)}"),
+    ]
 
 
 def _inliers(result: RegistrationResult) -> str:

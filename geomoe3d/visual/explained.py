@@ -19,12 +19,15 @@ def explained_view(explanation: Explanation) -> RegistrationView:
         explanation: what `geomoe3d.registration.Registrar.explain` returned.
     """
     source, target, matched = explanation.source, explanation.target, explanation.correspondences
+    filtered = explanation.result.config["filter"]["name"] != "none"  # which weighs everything alike
     return RegistrationView(
         source.file_points,
         target.file_points,
         explanation.result,
         np.column_stack([matched.source + source.origin, matched.target + target.origin]),
-        weights=explanation.weights,
+        weights=explanation.weights if filtered else None,
         source_colors=source.colors,
         target_colors=target.colors,
+        groups=explanation.groups,
+        group_names=explanation.group_names,
     )

@@ -27,6 +27,7 @@ from geomoe3d.cli.summary import matrix_text, summary
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.data.sample import write_sample_pair
 from geomoe3d.errors import CheckpointError, ConfigError, DependencyError, EmptyCloudError, OutputError
+from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import (
     inverse,
     make_transform,
@@ -99,10 +100,8 @@ class FakeRegistrar:
             source=PointCloud(points),
             target=PointCloud(moved - origin, origin=origin),
             correspondences=Correspondences(np.column_stack([points, moved - origin])),
-            weights=np.ones(50),
+            weighed=FilterOutput(np.ones(50)),
             inliers=np.ones(50, dtype=bool),
-            groups=None,
-            group_names=(),
         )
 
 

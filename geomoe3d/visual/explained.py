@@ -25,9 +25,9 @@ def explained_view(explanation: Explanation) -> RegistrationView:
         target.file_points,
         explanation.result,
         np.column_stack([matched.source + source.origin, matched.target + target.origin]),
-        weights=explanation.weights if filtered else None,
+        weights=explanation.weighed.weights if filtered else None,
         source_colors=source.colors,
         target_colors=target.colors,
-        groups=explanation.groups,
-        group_names=explanation.group_names,
+        groups=explanation.weighed.groups,
+        group_names=explanation.weighed.group_names,
     )

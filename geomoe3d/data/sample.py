@@ -16,12 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.data.sample_room import Room, furnished_room
+from geomoe3d.data.rooms.sensor import Camera, cast
+from geomoe3d.data.rooms.solids import Solids
+from geomoe3d.data.rooms.walk import camera_pose as _camera_pose
+from geomoe3d.data.sample_room import furnished_room
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 from geomoe3d.types import FloatArray, PointCloud
 
-_WIDTH, _HEIGHT, _FOCAL = 320, 240, 262.5  # half a Kinect: 63 by 49 degrees
+_CAMERA = Camera(320, 240, 262.5)  # 63 by 49 degrees
 _NEAR, _FAR = 0.4, 4.5
 _GRID = 0.0125  # one point is kept per voxel of this edge, as fusing the frames of a fragment does
 
@@ -94,22 +97,8 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
     return paths
 
 
-def _camera_pose(
-    eye: tuple[float, float, float] | FloatArray, yaw_deg: float, pitch_deg: float, roll_deg: float
-) -> FloatArray:
-    """T_world_camera of a camera that looks along its z, x right and y down."""
-    yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
-    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    c, s = np.cos(roll), np.sin(roll)
-    R = np.column_stack([c * right + s * down, c * down - s * right, forward])
-    return make_transform(R, np.asarray(eye, dtype=np.float64))
-
-
 def _view(
-    room: Room,
+    room: Solids,
     eye: tuple[float, float, float],
     yaws_deg: tuple[float, ...],
     name: str,
@@ -143,22 +132,11 @@ def _depth_frame(
     scene: Any, face_colors: FloatArray, T_world_camera: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """One depth image as (n, 3) points in the camera's frame and their (n, 3) colours."""
-    import open3d as o3d
-
-    u, v = np.meshgrid(np.arange(_WIDTH) - (_WIDTH - 1) / 2, np.arange(_HEIGHT) - (_HEIGHT - 1) / 2)
-    rays = np.stack([u / _FOCAL, v / _FOCAL, np.ones_like(u)], axis=-1).reshape(-1, 3)  # z = 1: t is depth
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    bundle = np.column_stack([np.broadcast_to(t, rays.shape), rays @ R.T]).astype(np.float32)
-    hits = scene.cast_rays(o3d.core.Tensor.from_numpy(bundle))
-    depth = hits["t_hit"].numpy().astype(np.float64)
-    normals = hits["primitive_normals"].numpy().astype(np.float64)
-    triangle = hits["primitive_ids"].numpy()
-
-    directions = bundle[:, 3:] / np.linalg.norm(bundle[:, 3:], axis=1, keepdims=True)
-    slope = np.abs(np.einsum("ij,ij->i", directions, normals))
+    hits = cast(scene, _CAMERA, T_world_camera)
+    depth, slope, rays = hits.depth.ravel(), hits.slope.ravel(), _CAMERA.rays()
     dropped = rng.uniform(size=len(depth)) > np.clip((slope - 0.05) / 0.20, 0, 1)
     sigma = np.clip(0.0015 * np.where(np.isfinite(depth), depth, 0.0) ** 2, 0.003, 0.015)
     noisy = depth + sigma * rng.standard_normal(len(depth))
     seen = np.isfinite(depth) & (depth > _NEAR) & (depth < _FAR) & ~dropped
     points: FloatArray = rays[seen] * noisy[seen, None]
-    return points, face_colors[triangle[seen]]
+    return points, face_colors[hits.triangle[seen]]

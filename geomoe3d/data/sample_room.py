@@ -7,88 +7,10 @@ room has no symmetry. Milliseconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
-
 import numpy as np
 
-from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.types import FloatArray, IntArray
-
-Triple = tuple[float, float, float]
-
-
-@dataclass
-class Room:
-    """Triangles with one colour per object, world frame: metres, z up, floor at zero."""
-
-    vertices: list[FloatArray] = field(default_factory=list)
-    faces: list[IntArray] = field(default_factory=list)
-    colors: list[FloatArray] = field(default_factory=list)
-    num_vertices: int = 0
-
-    def scene(self) -> Any:
-        """Open3D's ray casting scene of all triangles."""
-        import open3d as o3d
-
-        scene = o3d.t.geometry.RaycastingScene()
-        tensor = o3d.core.Tensor.from_numpy
-        scene.add_triangles(
-            tensor(np.concatenate(self.vertices).astype(np.float32)),
-            tensor(np.concatenate(self.faces).astype(np.uint32)),
-        )
-        return scene
-
-    def add(self, mesh: Any, color: Triple) -> None:
-        """One trimesh object in world coordinates."""
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.asarray(mesh.faces) + self.num_vertices
-        self.vertices.append(vertices)
-        self.faces.append(faces)
-        self.colors.append(np.tile(color, (len(faces), 1)))
-        self.num_vertices += len(vertices)
-
-    def box(
-        self,
-        corner: Triple,
-        size: Triple,
-        color: Triple,
-        turn_deg: float = 0.0,
-        about: tuple[float, float] | None = None,
-    ) -> None:
-        """A box from its lowest corner and edges, turned about the vertical through ``about``."""
-        import trimesh
-
-        mesh = trimesh.creation.box(extents=size)
-        mesh.apply_translation(np.asarray(corner) + np.asarray(size) / 2)
-        x, y = about if about is not None else (corner[0] + size[0] / 2, corner[1] + size[1] / 2)
-        mesh.apply_transform(_turn(turn_deg, (x, y, 0.0)))
-        self.add(mesh, color)
-
-    def cylinder(
-        self,
-        foot: Triple,
-        radius: float,
-        height: float,
-        color: Triple,
-        top_radius: float | None = None,
-    ) -> None:
-        """An upright cylinder on its foot, or a blunt cone where ``top_radius`` differs."""
-        import trimesh
-
-        mesh = trimesh.creation.cylinder(radius=radius, height=height, sections=24)
-        if top_radius is not None:
-            upper = mesh.vertices[:, 2] > 0
-            mesh.vertices[upper, :2] *= top_radius / radius
-        mesh.apply_translation([foot[0], foot[1], foot[2] + height / 2])
-        self.add(mesh, color)
-
-
-def _turn(angle_deg: float, about: Triple) -> FloatArray:
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    center = np.asarray(about)
-    return make_transform(R, center - R @ center)
+from geomoe3d.data.rooms.solids import Solids as Room
+from geomoe3d.data.rooms.solids import Triple
 
 
 def _draw(rng: np.random.Generator, low: float, high: float) -> Triple:

@@ -10,11 +10,10 @@ on from last.pt. Under torchrun every process runs this; the first one writes.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch.nn.parallel import DistributedDataParallel
@@ -27,52 +26,11 @@ from geomoe3d.training.batches import Batch, open_training, training_loader, val
 from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint, source_commit
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.distributed import Process, choose_device, join
-from geomoe3d.training.logs import CsvLog, TensorBoardLog, draw_curves
+from geomoe3d.training.logs import draw_curves
 from geomoe3d.training.measures import evaluate
+from geomoe3d.training.reporting import Rate, Reporter, RunLogs, Summary
 from geomoe3d.training.schedule import learning_rate
 from geomoe3d.training.step import AveragedWeights, Updater
-
-_TRAIN_COLUMNS = [
-    "loss", "classification", "regression", "balance", "precision", "recall", "f1", "kept_fraction",
-    "router_entropy", "unsolved", "gradient_norm", "learning_rate", "skipped", "pairs_per_s",
-]  # fmt: skip
-_VALIDATION_COLUMNS = ["precision", "recall", "f1", "registration_recall", "best"]
-
-
-class Reporter(Protocol):
-    """Where a run says what it does; the command line draws it live."""
-
-    def started(self, config: TrainConfig, first_step: int, notes: list[str]) -> None:
-        """Before the first step."""
-
-    def stepped(self, step: int, measures: dict[str, float], pairs_per_s: float, skipped: int) -> None:
-        """After every step."""
-
-    def validated(self, step: int, measures: dict[str, float], best: bool) -> None:
-        """After a validation."""
-
-
-@dataclass
-class Summary:
-    """How a run ended.
-
-    Attributes:
-        step: steps done.
-        skipped: steps whose gradient was not finite.
-        best_step: step of the best validation, 0 if there was none.
-        best: its measures.
-        finished: False if it was asked to stop.
-        weights: what was exported, or None if unfinished.
-        pairs_per_s: training throughput of this process group.
-    """
-
-    step: int
-    skipped: int
-    best_step: int
-    best: dict[str, float]
-    finished: bool
-    weights: Path | None
-    pairs_per_s: float
 
 
 @dataclass
@@ -156,14 +114,14 @@ class TrainingRun:
         updater = Updater(self.model, wrapped, self.optimizer, config)
         loader = training_loader(config, self.pairs, progress.step, self.process.rank, self.process.world)
         batches: Iterator[Batch] = iter(loader)
-        logs = _Logs(self.folder, config, progress.step) if self.process.is_first else None
+        logs = RunLogs(self.folder, config, progress.step) if self.process.is_first else None
         if logs is not None and logs.board.missing:
             self.notes.append("TensorBoard is not installed (pip install tensorboard): CSV logs only")
         if self.process.is_first:
             reporter.started(config, progress.step, self.notes)
         samples = validation_samples(config) if self.process.is_first else []
         pairs_per_step = config.batch_size * config.accumulation * self.process.world
-        rate = _Rate(pairs_per_step)
+        rate = Rate(pairs_per_step)
         while progress.step < last_step and not self.stop:
             along = progress.step / config.steps
             lr = learning_rate(config.optimizer, along)
@@ -224,7 +182,7 @@ class TrainingRun:
                 f"lower optimizer.learning_rate, or train in float32; last.pt holds the run before"
             )
 
-    def _validate(self, samples: list[Any], logs: _Logs, reporter: Reporter) -> None:
+    def _validate(self, samples: list[Any], logs: RunLogs, reporter: Reporter) -> None:
         progress, config = self.progress, self.config
         measures = evaluate(self.shipped, samples, self.device)
         key = "registration_recall" if config.validation.best_metric == "recall" else "f1"
@@ -304,57 +262,6 @@ class TrainingRun:
             raise OutputError(f"'{self.folder}' holds a run already; give another folder, or leave --fresh")
         if not self.last_path.exists() and (self.folder / "weights.safetensors").exists():
             raise OutputError(f"'{self.folder}' holds weights but no run to go on with; give another folder")
-
-
-class _Logs:
-    """The CSV files and TensorBoard of a run."""
-
-    def __init__(self, folder: Path, config: TrainConfig, first_step: int) -> None:
-        network = config.network
-        experts = []
-        if network.feed_forward == "moe":
-            for layer in range(network.num_layers):
-                for place in (1, 2):
-                    where = f"layer{layer + 1}_moe{place}"
-                    experts += [f"{where}_entropy"]
-                    experts += [f"{where}_expert{i + 1}" for i in range(network.num_experts)]
-        self._experts = experts
-        self._train = CsvLog(folder / "train.csv", _TRAIN_COLUMNS, first_step)
-        self._usage = CsvLog(folder / "experts.csv", experts, first_step) if experts else None
-        self._validation = CsvLog(folder / "validation.csv", _VALIDATION_COLUMNS, first_step)
-        self.board = TensorBoardLog(folder, first_step, config.logging.tensorboard)
-
-    def training(self, step: int, values: dict[str, float]) -> None:
-        kept = {name: values[name] for name in _TRAIN_COLUMNS if name in values}
-        usage = {name: values[name] for name in self._experts if name in values}
-        self._train.add(step, kept)
-        self.board.add(step, "train", kept)
-        if self._usage is not None:
-            self._usage.add(step, usage)
-            self.board.add(step, "experts", usage)
-
-    def validation(self, step: int, values: dict[str, float]) -> None:
-        self._validation.add(step, values)
-        self.board.add(step, "validation", values)
-
-
-class _Rate:
-    """Pairs per second, smoothed over the last steps, pauses left out."""
-
-    def __init__(self, pairs_per_step: int) -> None:
-        self.pairs_per_step = pairs_per_step
-        self.value = 0.0
-        self._last: float | None = time.perf_counter()
-
-    def tick(self) -> None:
-        now = time.perf_counter()
-        if self._last is not None:
-            current = self.pairs_per_step / max(now - self._last, 1e-9)
-            self.value = current if self.value == 0 else 0.9 * self.value + 0.1 * current
-        self._last = now
-
-    def pause(self) -> None:
-        self._last = time.perf_counter()
 
 
 def _yaml(config: TrainConfig) -> str:

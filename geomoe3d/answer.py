@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -24,7 +24,7 @@ class Findings:
     Attributes:
         T_target_source: (4, 4) the answer, or NaN where there was no hypothesis.
         alternative: the best clearly different motion, or None.
-        lead: score of the answer over that of the alternative; inf without one.
+        lead: score of the answer over that of the alternative, see `judge.lead_over`.
         evidence, information, judgement: see their classes; evidence None where there was no hypothesis.
     """
 
@@ -67,6 +67,7 @@ def finished_result(
         reasons=findings.judgement.reasons,
         confidence=findings.judgement.confidence,
         overlap=findings.evidence.overlap if findings.evidence else 0.0,
+        evidence={**asdict(findings.evidence), "score": findings.evidence.score} if findings.evidence else {},
         num_correspondences=len(matched),
         num_inliers=int((findings.residuals(matched) < threshold).sum()),
         inlier_threshold=threshold,
@@ -106,6 +107,7 @@ def failed_result(
         reasons=(reason,),
         confidence=0.0,
         overlap=0.0,
+        evidence={},
         num_correspondences=0,
         num_inliers=0,
         inlier_threshold=nan,

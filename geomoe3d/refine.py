@@ -46,8 +46,8 @@ def refine(
     voxel = source.voxel_size
     start = T_target_source.copy()
     start[:3, 3] /= voxel
-    target_cloud, target_tree = _cloud(target, voxel)
-    source_cloud, _ = _cloud(source, voxel)
+    target_cloud, target_tree = _cloud(target, voxel, normals=True)
+    source_cloud, _ = _cloud(source, voxel, normals=config.method == "gicp")
     answer = small_gicp.align(
         target_cloud,
         source_cloud,
@@ -76,10 +76,11 @@ def refine(
     return T, None
 
 
-def _cloud(cloud: PreparedCloud, voxel: float) -> tuple[Any, Any]:
+def _cloud(cloud: PreparedCloud, voxel: float, *, normals: bool) -> tuple[Any, Any]:
     import small_gicp
 
     made = small_gicp.PointCloud(cloud.points / voxel)
     tree = small_gicp.KdTree(made, num_threads=1)
-    small_gicp.estimate_normals_covariances(made, tree, num_neighbors=20, num_threads=1)
+    if normals:
+        small_gicp.estimate_normals_covariances(made, tree, num_neighbors=20, num_threads=1)
     return made, tree

@@ -14,7 +14,7 @@ from geomoe3d.answer import Findings, failed_result, finished_result
 from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.matching import match
-from geomoe3d.clouds.prepare import choose_voxel_size, find_viewpoints, prepare, scale_mismatch
+from geomoe3d.clouds.prepare import check_cloud, choose_voxel_size, find_viewpoints, prepare, scale_mismatch
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
@@ -98,6 +98,8 @@ class Registrar:
         config, seed, clock = self.config, self.config.seed, StageClock(progress)
         clock("load")
         clouds = _load(source, "source", seed), _load(target, "target", seed)
+        for cloud in clouds:
+            check_cloud(cloud)
         mismatch = scale_mismatch(*clouds)
         if mismatch is not None:
             return Explanation(failed_result(clouds, mismatch, config, clock.stop()), *clouds)
@@ -160,9 +162,7 @@ class Registrar:
     ) -> Findings:
         """Choose the best hypothesis, refine it and judge it against the best other one."""
         if not ranked:
-            return Findings.nothing(
-                "no rigid motion brings three correspondences in general position together"
-            )
+            return Findings.nothing("no motion brings three correspondences in general position together")
         source, target = described
         start = (ranked if self.config.verification.enabled else verifier.rank(hypotheses[:1]))[0][0]
         T, note = refine(start.T_target_source, source, target, self.config.refinement)

@@ -69,6 +69,8 @@ class RegistrationResult:
         reasons: why the status is not ok, or what deserves attention; sentences.
         confidence: in [0, 1]; see docs/concepts.md for what it is made of.
         overlap: share of source voxel points with a target surface point within the inlier threshold.
+        evidence: what the clouds say of the answer, see `geomoe3d.verification.Evidence`; empty where
+            nothing was estimated.
         num_correspondences: correspondences given to the estimator.
         num_inliers: of these, how many agree with the transform.
         inlier_threshold: residual limit of an inlier, cloud units.
@@ -91,6 +93,7 @@ class RegistrationResult:
     reasons: tuple[str, ...]
     confidence: float
     overlap: float
+    evidence: dict[str, float]
     num_correspondences: int
     num_inliers: int
     inlier_threshold: float

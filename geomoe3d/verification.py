@@ -100,10 +100,13 @@ class Verifier:
         """What the clouds say of one motion (4, 4) in local coordinates."""
         moved = transform_points(T_target_source, self._points)
         distance, nearest = self._tree.query(moved, distance_upper_bound=self._threshold)
+        distance, nearest = np.asarray(distance), np.asarray(nearest)
         hit = np.flatnonzero(np.isfinite(distance))
         nearest = nearest[hit]
         normals = self._normals[hit] @ T_target_source[:3, :3].T
-        agrees = np.einsum("ij,ij->i", normals, self._target.normals[nearest]) > _LEAST_COSINE
+        cosine = np.einsum("ij,ij->i", normals, self._target.normals[nearest])
+        # Without sensor positions the normals' signs are a guess, and only their lines can be compared.
+        agrees = (cosine if self._target_view is not None else np.abs(cosine)) > _LEAST_COSINE
         similarity = np.einsum("ij,ij->i", self._features[hit], self._target_features[nearest])
         more_similar = (self._random_similarity[hit] > similarity[:, None]).sum(1)
         p_value = (1 + more_similar) / (1 + self._random_similarity.shape[1])

@@ -29,7 +29,7 @@ def describe(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
     search = o3d.geometry.KDTreeSearchParamHybrid(
         config.feature_radius * cloud.voxel_size, config.feature_neighbors
     )
-    raw = o3d.pipelines.registration.compute_fpfh_feature(geometry, search)
+    raw = o3d.pipelines.registration.compute_fpfh_feature(geometry, search)  # type: ignore[call-arg]
     features = np.asarray(raw.data).T.astype(np.float32)
     features = np.where(np.isfinite(features), features, np.float32(0))
     features /= np.linalg.norm(features, axis=1, keepdims=True) + np.float32(1e-6)

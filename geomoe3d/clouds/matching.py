@@ -31,10 +31,9 @@ def match(
     """
     if source.features is None or target.features is None:
         raise InputError("match needs described clouds; call describe(cloud, config) on both first")
-    index, distance, ratio, backward = nearest_features(source.features, target.features, config.neighbors)
+    index, distance, ratio, mutual = nearest_features(source.features, target.features, config.neighbors)
     rows = np.repeat(np.arange(len(source)), index.shape[1])
-    columns = index.ravel()
-    mutual = backward[columns] == rows
+    columns, mutual = index.ravel(), mutual.ravel()
     keep: BoolArray = np.ones(len(rows), dtype=np.bool_)
     if config.method == "mutual":
         keep = mutual
@@ -57,8 +56,8 @@ def match(
 
 def nearest_features(
     source: Float32Array, target: Float32Array, neighbors: int
-) -> tuple[IntArray, Float32Array, Float32Array, IntArray]:
-    """The nearest target features of each source feature, and the way back.
+) -> tuple[IntArray, Float32Array, Float32Array, BoolArray]:
+    """The nearest target features of each source feature, and whether the choice is mutual.
 
     Args:
         source: (n, d) unit features.
@@ -68,24 +67,20 @@ def nearest_features(
     Returns:
         Index (n, k) of the nearest targets, best first; their Euclidean distance (n, k); the ratio (n, k)
         of that distance to the one of the next best target outside the k (1 where there is none or where
-        both are zero); and for each target (m,) its nearest source.
+        both are zero); and whether the source is also the nearest to that target (n, k), shared ties
+        included.
     """
     k = min(neighbors, len(target))
     index = np.empty((len(source), k), dtype=np.int64)
     best = np.empty((len(source), k), dtype=np.float32)
     beyond = np.full(len(source), -np.inf, dtype=np.float32)
-    backward = np.zeros(len(target), dtype=np.int64)
-    backward_best = np.full(len(target), -np.inf, dtype=np.float32)
+    column_best = np.full(len(target), -np.inf, dtype=np.float32)
     step = max(1, _BLOCK_ENTRIES // len(target))
     for start in range(0, len(source), step):
         similarity = source[start : start + step] @ target.T
         stop = start + len(similarity)
         rows = np.arange(len(similarity))
-        column_best = similarity.argmax(0)
-        column_value = similarity[column_best, np.arange(len(target))]
-        better = column_value > backward_best
-        backward[better] = column_best[better] + start
-        backward_best[better] = column_value[better]
+        np.maximum(column_best, similarity.max(0), out=column_best)
         for rank in range(k):
             choice = similarity.argmax(1)
             index[start:stop, rank] = choice
@@ -97,4 +92,6 @@ def nearest_features(
     next_distance = np.sqrt(np.maximum(2 - 2 * np.where(np.isfinite(beyond), beyond, 1), 0))[:, None]
     usable = np.isfinite(beyond)[:, None] & (next_distance > 0)
     ratio = np.where(usable, distance / np.where(usable, next_distance, 1), 1)
-    return index, distance, np.minimum(ratio, 1).astype(np.float32), backward
+    # Comparing values instead of indices saves the slow search along the columns.
+    mutual: BoolArray = best >= column_best[index]
+    return index, distance, np.minimum(ratio, 1).astype(np.float32), mutual

@@ -138,7 +138,8 @@ class ConsensusEstimator:
     ) -> Hypothesis | None:
         """A last fit in float64 on the inliers; None where they do not determine a motion."""
         centred = rows - centre
-        R64, t64 = R.astype(np.float64), t.astype(np.float64) * inlier_threshold
+        R64: Floats = R.astype(np.float64)
+        t64: Floats = t.astype(np.float64) * inlier_threshold
         r2 = squared_residuals(R64[None], t64[None], centred[:, :3], centred[:, 3:])[0] / inlier_threshold**2
         w = vote * (r2 < 1) / (1 + r2)
         # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
@@ -153,7 +154,8 @@ class ConsensusEstimator:
 def bundle_weights(target: FloatArray) -> Float32Array:
     """1 / sqrt(number of correspondences that share the target point), (N,) float32."""
     _, inverse, counts = np.unique(target, axis=0, return_inverse=True, return_counts=True)
-    return (1.0 / np.sqrt(counts[inverse.ravel()])).astype(np.float32)
+    weights: Float32Array = (1.0 / np.sqrt(counts[inverse.ravel()])).astype(np.float32)
+    return weights
 
 
 def pairwise_distances(points: Float32Array) -> Float32Array:
@@ -164,7 +166,8 @@ def pairwise_distances(points: Float32Array) -> Float32Array:
     distances += squares[:, None]
     distances += squares[None]
     np.maximum(distances, 0, out=distances)
-    return np.sqrt(distances, out=distances)
+    np.sqrt(distances, out=distances)
+    return distances
 
 
 def compatibility(source_distance: Float32Array, target_distance: Float32Array) -> Float32Array:
@@ -206,8 +209,13 @@ def local_sets(
     second = (first * vote) @ compatible
     second *= first
     second *= vote
-    members = np.argpartition(second, -size, axis=1)[:, -size:]
-    weights = np.take_along_axis(second, members, 1)
+    members = np.empty((len(seeds), size), dtype=np.int64)
+    weights = np.empty((len(seeds), size), dtype=np.float32)
+    rows = np.arange(len(seeds))
+    for rank in range(size):  # a few passes for the maximum are much faster than a partition
+        members[:, rank] = second.argmax(1)
+        weights[:, rank] = second[rows, members[:, rank]]
+        second[rows, members[:, rank]] = -1
     seed_weight = weights.max(1, keepdims=True) + np.float32(1e-6)
     return np.concatenate([seeds[:, None], members], 1), np.concatenate([seed_weight, weights], 1)
 

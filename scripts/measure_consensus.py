@@ -1,0 +1,61 @@
+"""Registration recall and time of consensus and RANSAC on the fixed 1k correspondences of the dev half.
+
+    python scripts/measure_consensus.py [--every 1]
+
+Success: rotation error < 15 deg and translation error < 30 cm, strict. Both methods see every pair one
+after the other, so that the ratio of their times holds on a busy machine. Needs the benchmark data
+(GEOMOE3D_DATA).
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+
+from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
+from geomoe3d.estimators.base import Estimator
+from geomoe3d.estimators.consensus import ConsensusEstimator
+from geomoe3d.estimators.ransac import RansacEstimator
+from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
+
+INLIER_THRESHOLD = 0.10
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--every", type=int, default=1, help="take every n-th pair")
+    every = parser.parse_args().every
+    methods: dict[str, Estimator] = {
+        "consensus": ConsensusEstimator(),
+        "Open3D RANSAC 50k": RansacEstimator(iterations=50_000, confidence=0.999),
+    }
+    print("| benchmark | method | pairs | recall | any hypothesis right | median time |")
+    print("|---|---|---|---|---|---|")
+    for benchmark in BENCHMARKS:
+        seconds: dict[str, list[float]] = {name: [] for name in methods}
+        best: dict[str, int] = dict.fromkeys(methods, 0)
+        anywhere: dict[str, int] = dict.fromkeys(methods, 0)
+        pairs = list(iterate_fixed_correspondences(None, benchmark))[::every]
+        for pair in pairs:
+            for name, estimate in methods.items():
+                begin = time.perf_counter()
+                found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, seed=0)
+                seconds[name].append(time.perf_counter() - begin)
+                right = [
+                    rotation_error_deg(h.T_target_source, pair.T_target_source) < 15
+                    and translation_error(h.T_target_source, pair.T_target_source) < 0.30
+                    for h in found
+                ]
+                best[name] += bool(right and right[0])
+                anywhere[name] += any(right)
+        for name in methods:
+            shares = f"{100 * best[name] / len(pairs):.2f} % | {100 * anywhere[name] / len(pairs):.2f} %"
+            median = 1000 * statistics.median(seconds[name])
+            print(f"| {benchmark} | {name} | {len(pairs)} | {shares} | {median:.1f} ms |", flush=True)
+        ratio = statistics.median(seconds["consensus"]) / statistics.median(seconds["Open3D RANSAC 50k"])
+        print(f"\nconsensus takes {ratio:.2f} x the median time of RANSAC\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -21,7 +21,7 @@ from geomoe3d.data.rooms.solids import Solids
 from geomoe3d.data.rooms.walk import camera_pose as _camera_pose
 from geomoe3d.data.sample_room import furnished_room
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
+from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import FloatArray, PointCloud
 
 _CAMERA = Camera(320, 240, 262.5)  # 63 by 49 degrees

@@ -15,7 +15,7 @@ import numpy as np
 from geomoe3d.config import Section
 from geomoe3d.data.rooms.scenes import Scene
 from geomoe3d.data.rooms.sensor import Camera, Hits, cast
-from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
+from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.types import FloatArray
 
 _FINDER = Camera(40, 30, 36.5)  # a Kinect's view in few pixels
@@ -214,8 +214,3 @@ def _flatness(hits: Hits, usable: np.ndarray, stand: Stand) -> float:
             continue
         best = max(best, float(np.mean(np.abs((points - a) @ (normal / length)) < 0.04)))
     return best
-
-
-def relative(first: FloatArray, second: FloatArray) -> FloatArray:
-    """T_first_second of two world poses."""
-    return inverse(first) @ second

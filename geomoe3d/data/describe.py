@@ -1,0 +1,180 @@
+"""From posed fragments of any layout to shards of described ones: the step that is done once.
+
+Points, normals and features are those of registration itself (5 cm voxels, normals turned to the sensor,
+L2-normalised FPFH). About 0.1 s per fragment on one core.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.prepare import prepare
+from geomoe3d.config import PreparationConfig
+from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
+from geomoe3d.data.fusion import measure_overlap
+from geomoe3d.data.shards import DescribedScene, is_shard, why_stale, write_shard
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
+from geomoe3d.types import Float32Array, PointCloud
+
+VOXEL_SIZE = 0.05
+
+
+@dataclass
+class DescribeReport:
+    """What a run came to.
+
+    Attributes:
+        folder: of the shards.
+        made: shards made.
+        kept: shards that were there and fit.
+        num_fragments: in the shards made.
+        num_pairs: in the shards made.
+        skipped: one sentence per fragment or scene that was left out.
+    """
+
+    folder: Path
+    made: int = 0
+    kept: int = 0
+    num_fragments: int = 0
+    num_pairs: int = 0
+    skipped: list[str] = field(default_factory=list)
+
+
+def describe_fragment(cloud: PointCloud, voxel_size: float = VOXEL_SIZE) -> tuple[Float32Array, Float32Array]:
+    """Voxel points (n, 3) and unit features (n, 33) float32 of a fragment whose sensor is at its origin.
+
+    Raises:
+        EmptyCloudError: fewer than 3 voxels.
+    """
+    config = PreparationConfig()
+    prepared = describe(prepare(cloud, voxel_size, config, viewpoint=-cloud.origin), config)
+    assert prepared.features is not None
+    return (prepared.points + cloud.origin).astype(np.float32), prepared.features
+
+
+def describe_collection(
+    root: str | Path,
+    folder: str | Path,
+    *,
+    groups: tuple[str, ...] | None = None,
+    scenes: tuple[str, ...] | None = None,
+    min_overlap: float = 0.1,
+    voxel_size: float = VOXEL_SIZE,
+    progress: Callable[[int, int], None] | None = None,
+) -> DescribeReport:
+    """Make one shard per scene of a folder of posed fragments; those that are there and fit stay.
+
+    Args:
+        root: any layout that `open_collection` knows.
+        folder: of the shards; is made.
+        groups: lists of pairs to take; None takes all.
+        scenes: scenes to take; None takes all.
+        min_overlap: pairs below it are left out; where no overlap is listed it is measured.
+        voxel_size: metres.
+        progress: called with (scenes done, scenes in all).
+
+    Raises:
+        InputError: the layout is unknown, or no pair is left.
+        FormatError: a shard in the folder is damaged or stale; the message says why.
+        OutputError: the disk refuses.
+    """
+    collection = open_collection(root)
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    by_scene: dict[str, list[PosedPair]] = {}
+    for pair in collection.pairs:
+        if (groups is None or pair.group in groups) and (scenes is None or pair.scene in scenes):
+            by_scene.setdefault(pair.scene, []).append(pair)
+    if not by_scene:
+        raise InputError(f"'{root}' lists no pairs of the wanted scenes and groups")
+    report = DescribeReport(folder, skipped=list(collection.problems))
+    settings = {
+        "voxel_size": voxel_size,
+        "min_overlap": min_overlap,
+        "preparation": PreparationConfig().model_dump(mode="json"),
+        "groups": list(groups) if groups is not None else None,
+    }
+    for number, (scene, pairs) in enumerate(by_scene.items()):
+        target = folder / scene.replace("/", "_")
+        source = _fingerprint(pairs)
+        if is_shard(target):
+            reason = why_stale(target, settings, source)
+            if reason is not None:
+                raise FormatError(f"shard '{target}' is stale: {reason}; remove it, or give another folder")
+            report.kept += 1
+        else:
+            described = _describe_scene(scene, pairs, min_overlap, voxel_size, report.skipped)
+            if described is not None:
+                write_shard(target, described, settings, source)
+                report.made += 1
+                report.num_fragments += len(described.start) - 1
+                report.num_pairs += len(described.pair)
+        if progress is not None:
+            progress(number + 1, len(by_scene))
+    return report
+
+
+def _describe_scene(
+    scene: str, pairs: list[PosedPair], min_overlap: float, voxel_size: float, skipped: list[str]
+) -> DescribedScene | None:
+    paths = sorted({path for pair in pairs for path in (pair.source, pair.target)})
+    index: dict[Path, int] = {}
+    points: list[Float32Array] = []
+    features: list[Any] = []
+    for path in paths:
+        try:
+            found = describe_fragment(load_fragment(path), voxel_size)
+        except GeoMoE3DError as error:
+            skipped.append(str(error) if str(path) in str(error) else f"'{path}': {error}")
+            continue
+        index[path] = len(points)
+        points.append(found[0])
+        features.append(found[1].astype(np.float16))
+    rows, motions, overlaps = [], [], []
+    for pair in pairs:
+        if pair.source not in index or pair.target not in index:
+            continue
+        i, j = index[pair.source], index[pair.target]
+        overlap = pair.overlap
+        if overlap is None:
+            a, b = points[i].astype(np.float64), points[j].astype(np.float64)
+            overlap = measure_overlap(a, b, pair.T_target_source, radius=voxel_size)
+        if overlap >= min_overlap:
+            rows.append((i, j))
+            motions.append(pair.T_target_source)
+            overlaps.append(overlap)
+    if not rows:
+        skipped.append(f"scene '{scene}': no pair overlaps by {min_overlap} or more")
+        return None
+    return DescribedScene(
+        scene,
+        np.concatenate(points),
+        np.concatenate(features),
+        np.cumsum([0, *map(len, points)]).astype(np.int64),
+        np.array(rows, dtype=np.int64),
+        np.stack(motions),
+        np.array(overlaps, dtype=np.float32),
+        voxel_size,
+    )
+
+
+def _fingerprint(pairs: list[PosedPair]) -> str:
+    """Hash of the fragments' names and sizes and of the true motions."""
+    digest = hashlib.sha256()
+    paths = sorted({path for pair in pairs for path in (pair.source, pair.target)})
+    sizes = [[path.name, path.stat().st_size if path.is_file() else -1] for path in paths]
+    digest.update(json.dumps(sizes).encode())
+    for pair in pairs:
+        digest.update(np.round(pair.T_target_source, 6).tobytes())
+    return digest.hexdigest()[:16]

@@ -55,6 +55,20 @@ def test_share_of_true_matches_is_the_one_asked_for(ratio: float) -> None:
     assert measured == pytest.approx(ratio, rel=0.1, abs=0.002)
 
 
+def test_density_of_the_source_points_does_not_give_the_true_ones_away() -> None:
+    """A network would learn such a giveaway instead of geometry, and fail on real scans."""
+    from scipy.spatial import cKDTree
+
+    config = SyntheticConfig(inlier_ratio=(0.1, 0.3), near_misses=(0.0, 0.0), voxel_size=(0.05, 0.05))
+    ratios = []
+    for i in range(25):
+        pair = SyntheticPairs(config, seed=8)[i]
+        source = pair.correspondences[:, :3]
+        spacing = cKDTree(source).query(source, 6)[0][:, 5]
+        ratios.append(np.median(spacing[pair.labels]) / np.median(spacing[~pair.labels]))
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.15)
+
+
 def test_structured_outliers_agree_on_another_motion() -> None:
     from geomoe3d.filters.architecture import NetworkConfig
     from geomoe3d.filters.inputs import pair_input

@@ -79,7 +79,7 @@ class SyntheticPairs:
 
     def identity(self) -> str:
         """Seed and settings."""
-        return f"synthetic:2:{self.seed}:{self.config.model_dump_json()}"
+        return f"synthetic:3:{self.seed}:{self.config.model_dump_json()}"
 
 
 def generate_pair(rng: np.random.Generator, config: SyntheticConfig) -> TrainingPair:
@@ -90,8 +90,7 @@ def generate_pair(rng: np.random.Generator, config: SyntheticConfig) -> Training
     num_like = num_true + num_near
     room = _Room(rng)
     T = _random_motion(rng, 3.0)
-    center, radius = rng.uniform(0, 1, 3) * room.size, float(rng.uniform(0.6, 3.0))
-    points, face = room.sample(rng, num, num_like, center, radius)
+    points, face = room.sample(rng, num, num_like)
     target = points.copy()
     spread = rng.uniform(*config.spread)
     off = np.concatenate([
@@ -146,17 +145,20 @@ class _Room:
         steps: FloatArray = length[:, None] * (np.cos(angle) * u + np.sin(angle) * v)
         return steps
 
-    def sample(
-        self, rng: np.random.Generator, num: int, num_region: int, center: FloatArray, radius: float
-    ) -> tuple[FloatArray, IntArray]:
-        """``num`` surface points and their faces, the first ``num_region`` of them near a center."""
-        face = rng.choice(len(self.share), size=num + 4 * num_region + 64, p=self.share)
+    def sample(self, rng: np.random.Generator, num: int, num_region: int) -> tuple[FloatArray, IntArray]:
+        """Surface points and their faces, evenly over the room; the first ``num_region`` share a region.
+
+        The region stands for the overlap of two scans. It holds other points too, as dense as elsewhere:
+        where points lie says which of them may be true, never which of them are.
+        """
+        face = rng.choice(len(self.share), size=num, p=self.share)
         points = self.on_faces(rng, face)
-        distance = np.linalg.norm(points - center, axis=1)
-        near = np.argsort(np.where(distance < radius, rng.random(len(face)), distance + 1))[:num_region]
-        rest = np.setdiff1d(np.arange(len(face)), near)[: num - num_region]
-        chosen = np.concatenate([near, rest])
-        return points[chosen], face[chosen]
+        center = points[rng.integers(num)]
+        inside = int(np.clip(num_region / rng.uniform(0.1, 0.8), num_region, num))
+        near = np.argsort(np.linalg.norm(points - center, axis=1))[:inside]
+        chosen = rng.permutation(near)[:num_region]
+        order = np.concatenate([chosen, np.setdiff1d(np.arange(num), chosen)])
+        return points[order], face[order]
 
 
 class _Box:

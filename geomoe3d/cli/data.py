@@ -187,3 +187,105 @@ def _intrinsics(text: str) -> FloatArray:
     except ValueError:
         raise click.BadParameter(f"'{text}' is not four numbers fx,fy,cx,cy") from None
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+@command.command(context_settings=HELP)
+@click.argument("out", type=click.Path())
+@click.argument("assignments", nargs=-1, metavar="[KEY=VALUE]...")
+@click.option("--scenes", required=True, type=click.IntRange(min=1), help="Scenes of the set.")
+@click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Another seed, another set."
+)
+@click.option("--models", multiple=True, type=click.Path(), help="Folder of furniture models; repeatable.")
+@click.option(
+    "--mesh", "meshes", multiple=True, type=click.Path(), help="Whole scene to walk through; repeatable."
+)
+@click.option("--config", type=click.Path(), help="YAML file of settings (see configs/data).")
+@click.option("--show", is_flag=True, help="Print the complete settings and stop.")
+@traceback_option
+def synthesize(
+    out: str,
+    assignments: tuple[str, ...],
+    scenes: int,
+    workers: int,
+    seed: int,
+    models: tuple[str, ...],
+    meshes: tuple[str, ...],
+    config: str | None,
+    show: bool,
+) -> None:
+    """Generate furnished rooms and record fragments in them, into the folder OUT.
+
+    Rooms come from simple solids alone unless --models or --mesh give more. Same seed, settings and
+    material: same bytes, whatever the number of workers. Started again, an interrupted run goes on. OUT
+    gets scene-NNNNN folders (cloud_bin_N.ply, gt.log), report.md and contact.png.
+    """
+    from pathlib import Path
+
+    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.config import build_config, read_yaml, set_keys
+    from geomoe3d.data.contact import draw_contact_sheet
+    from geomoe3d.data.report import report_text, write_report
+    from geomoe3d.data.settings import SynthesisSettings
+    from geomoe3d.data.synthesize import scene_name
+    from geomoe3d.data.synthesize import synthesize as make
+
+    tree = set_keys(read_yaml(config) if config else {}, list(assignments))
+    settings = build_config(SynthesisSettings, tree, config or "settings")
+    if show:
+        import yaml
+
+        click.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), nl=False)
+        return
+    with stdout_to_stderr(), progress_bar("scenes", quiet=False) as advance:
+        report = make(
+            out,
+            scenes,
+            seed=seed,
+            workers=workers,
+            settings=settings,
+            model_folders=list(models),
+            meshes=list(meshes),
+            progress=advance,
+        )
+        write_report(report, Path(out) / "report.md")
+        some = [Path(out) / scene_name(scene.number) for scene in report.scenes if scene.num_points][:8]
+        if some:
+            draw_contact_sheet(some, Path(out) / "contact.png", force=True)
+    click.echo(report_text(report), nl=False)
+
+
+@command.command(context_settings=HELP)
+@click.argument("root", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--group", "groups", multiple=True, help="List of pairs to take, e.g. train_info; repeatable.")
+@click.option("--scene", "scenes", multiple=True, help="Scene to take (default: all); repeatable.")
+@click.option("--min-overlap", default=0.1, show_default=True, help="Least overlap of a pair.")
+@traceback_option
+def features(
+    root: str, out: str, groups: tuple[str, ...], scenes: tuple[str, ...], min_overlap: float
+) -> None:
+    """Describe the fragments of ROOT once, into the shards OUT that training reads.
+
+    ROOT is any folder that 'geomoe3d data check' knows. Started again, it goes on; a shard that no longer
+    fits its fragments or settings is refused. Train with data.train=OUT.
+    """
+    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.data.describe import describe_collection
+
+    with stdout_to_stderr(), progress_bar("scenes", quiet=False) as advance:
+        report = describe_collection(
+            root,
+            out,
+            groups=groups or None,
+            scenes=scenes or None,
+            min_overlap=min_overlap,
+            progress=advance,
+        )
+    for line in report.skipped:
+        click.echo(f"skipped: {line}", err=True)
+    click.echo(
+        f"{report.made} shards made ({report.num_fragments} fragments, {report.num_pairs} pairs), "
+        f"{report.kept} kept, in {out}"
+    )

@@ -188,7 +188,7 @@ def draw_pair(
     for points, features in (source, target):
         rows = np.sort(rng.permutation(len(points))[:keypoints])
         clouds.append(_cloud(points[rows], features[rows], voxel_size))
-    found = match(*clouds, _MATCHING)
+    found = match(clouds[0], clouds[1], _MATCHING)
     residual = np.linalg.norm(transform_points(T_target_source, found.source) - found.target, axis=1)
     return TrainingPair(
         found.points.astype(np.float32),

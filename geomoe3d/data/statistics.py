@@ -111,7 +111,7 @@ def _of_fragment(points: NDArray[np.float32], rng: np.random.Generator) -> tuple
 
     cloud = points.astype(np.float64)
     nearest, _ = cKDTree(cloud).query(cloud[:: max(1, len(cloud) // 1000)], k=2)
-    return float(len(cloud)), plane_share(cloud, rng), float(np.median(nearest[:, 1]))
+    return float(len(cloud)), plane_share(cloud, rng), float(np.median(np.asarray(nearest)[:, 1]))
 
 
 def plane_share(points: FloatArray, rng: np.random.Generator) -> float:

@@ -186,6 +186,7 @@ def make_scene(job: Job, number: int) -> SceneSummary:
         temporary.mkdir()
         for k, cloud in enumerate(recorded.clouds):
             save_points(temporary / f"cloud_bin_{k}.ply", cloud)
+        np.savetxt(temporary / "poses.txt", np.reshape(recorded.poses, (-1, 16)), fmt="%.17g")
         write_gt_log(temporary / "gt.log", entries, len(recorded.clouds))
         write_gt_overlap(temporary / "gt_overlap.log", overlaps)
         text = json.dumps(asdict(summary), indent=1) + "\n"

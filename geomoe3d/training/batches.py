@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.inputs import BatchInput, PairInput, collate, pair_input
@@ -53,9 +55,17 @@ class Batch:
 
 
 def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
-    """The dataset that a configuration names: ``synthetic`` or a folder of shards."""
+    """The dataset that a configuration names: ``synthetic`` or a folder of shards, of either kind.
+
+    Shards of described fragments (``geomoe3d data features``) give fresh correspondences without end, shards
+    of correspondences (`write_shard`) those that they hold.
+    """
     if where == "synthetic":
         return SyntheticPairs(data.synthetic, seed)
+    if Path(where).is_dir() and any(is_shard(path) for path in Path(where).iterdir()):
+        from geomoe3d.data.draw import FragmentPairs
+
+        return FragmentPairs(where, seed=seed)
     return ShardFolder(where)
 
 

@@ -252,7 +252,11 @@ def bed(rng: np.random.Generator) -> Piece:
         s.blob((px, 0.28, top + 0.06), (0.32, 0.2, 0.1), rng, 0.15, color(rng))
     if rng.random() < 0.4:
         s.blob(
-            (float(rng.uniform(-0.3, 0.3)) * w, d * 0.7, top + 0.08), (0.4, 0.3, 0.12), rng, 0.5, color(rng)
+            (float(rng.uniform(-0.3, 0.3)) * w, d * 0.7, top + 0.08),
+            (min(0.4, 0.3 * w), 0.3, 0.12),
+            rng,
+            0.5,
+            color(rng),
         )
     return Piece("bed", s, w, d, top, [Shelf((-w / 2, w / 2), (0.6, d - 0.1), top + 0.05)])
 

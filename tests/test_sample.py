@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from geomoe3d.data import sample
-from geomoe3d.data.sample import make_sample_pair, write_sample_pair
 from geomoe3d.data.rooms.solids import Solids as Room
+from geomoe3d.data.sample import make_sample_pair, write_sample_pair
 from geomoe3d.data.sample_room import furnished_room
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.geometry.se3 import rotation_angle_deg, transform_points

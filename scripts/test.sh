@@ -25,7 +25,11 @@ cd "$checkout"
 say "ruff"
 "$python" -m ruff check .
 "$python" -m ruff format --check .
-say "mypy"
-"$python" -m mypy
+if "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+  say "mypy"
+  "$python" -m mypy
+else
+  say "mypy is left out: the numpy whose types the code is checked against needs Python 3.11"
+fi
 say "pytest"
 exec "$python" -m pytest "$@"

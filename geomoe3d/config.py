@@ -92,7 +92,11 @@ class VerificationConfig(Section):
 class RefinementConfig(Section):
     """Local refinement of the chosen hypothesis on the clouds."""
 
-    method: Literal["none", "icp", "gicp"] = Field("icp", description="how the chosen motion is polished")
+    method: Literal["none", "icp", "gicp"] = Field(
+        "gicp",
+        description="how the chosen motion is polished: icp is point-to-plane; gicp came two to four times "
+        "closer on generated scans at the same cost",
+    )
     max_distance: float = Field(1.5, gt=0, description="largest distance of matched points, in voxels")
     max_iterations: int = Field(30, ge=1, description="most steps of the refinement")
 

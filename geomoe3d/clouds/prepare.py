@@ -127,10 +127,12 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     """
     sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
     extent = float(np.ptp(points, axis=0).max())
-    size = extent / np.sqrt(num_points)
+    # A small cloud cannot fill the voxels asked for; half its points is what a grid can still even out.
+    goal = min(num_points, max(len(sample) // 2, 1))
+    size = extent / np.sqrt(goal)
     for _ in range(4):
         occupied = len(np.unique(voxel_keys(sample, size)))
-        size = min(size * float(np.sqrt(occupied / num_points)), extent)
+        size = min(size * float(np.sqrt(occupied / goal)), extent)
     return size
 
 

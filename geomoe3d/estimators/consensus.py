@@ -143,7 +143,8 @@ class ConsensusEstimator:
         r2 = squared_residuals(R64[None], t64[None], centred[:, :3], centred[:, 3:])[0] / inlier_threshold**2
         w = vote * (r2 < 1) / (1 + r2)
         # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
-        if (w > 0).sum() < 3 or spread(centred[:, :3], w) < 0.05 * inlier_threshold:
+        thinnest = min(spread(centred[:, :3], w), spread(centred[:, 3:], w))
+        if (w > 0).sum() < 3 or thinnest < 0.05 * inlier_threshold:
             return None
         R64, t64 = fit_rigid(centred[:, :3], centred[:, 3:], w)
         r2 = squared_residuals(R64[None], t64[None], centred[:, :3], centred[:, 3:])[0] / inlier_threshold**2

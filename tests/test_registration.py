@@ -1,0 +1,275 @@
+"""The whole line through the API: generated pairs with a known motion, and everything that must not be ok."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import geomoe3d
+from geomoe3d.config import load_config
+from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.errors import ConfigError, EmptyCloudError, InputError, NonFiniteError
+from geomoe3d.geometry.se3 import (
+    inverse,
+    make_transform,
+    rotation_error_deg,
+    transform_points,
+    translation_error,
+)
+from geomoe3d.registration import Registrar
+from geomoe3d.types import Correspondences
+
+MOTION = make_transform(Rotation.random(random_state=5).as_matrix(), np.array([1.0, -2.0, 0.5]))
+UTM = np.array([583394.0, 5283100.0, 498.0])
+
+
+@pytest.fixture(scope="module")
+def pair():
+    source, target, T = make_sample_pair(seed=0)
+    return source.file_points, target.file_points, T
+
+
+@pytest.fixture(scope="module")
+def answer(pair):
+    return geomoe3d.register(pair[0], pair[1])
+
+
+def box(size, count, seed):
+    """Points on the surface of a box, evenly per face."""
+    rng = np.random.default_rng(seed)
+    face = rng.integers(0, 6, count)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), face % 3] = np.where(face < 3, -0.5, 0.5)
+    return points * np.array(size)
+
+
+def images_apart(T_a, T_b, points):
+    """Largest distance between the images of the points under two motions."""
+    return np.abs(transform_points(T_a, points) - transform_points(T_b, points)).max()
+
+
+def test_sample_pair_lands_on_the_truth_and_knows_it(pair, answer):
+    assert answer.status == "ok"
+    assert answer.confidence > 0.95
+    assert rotation_error_deg(answer.T_target_source, pair[2]) < 0.5
+    assert translation_error(answer.T_target_source, pair[2]) < 0.01
+    assert 0.4 < answer.overlap < 0.8
+    assert 0 < answer.num_inliers < answer.num_correspondences <= 2000
+    stages = ("load", "prepare", "describe", "match", "weigh", "solve", "verify", "refine", "total")
+    assert tuple(answer.seconds) == stages
+    assert np.linalg.det(answer.T_target_source[:3, :3]) == pytest.approx(1, abs=1e-12)
+
+
+def test_same_seed_same_bytes(pair, answer):
+    again = geomoe3d.register(pair[0], pair[1])
+    assert again.T_target_source.tobytes() == answer.T_target_source.tobytes()
+    assert again.confidence == answer.confidence
+
+
+def test_threads_do_not_change_the_answer(tmp_path, pair):
+    np.save(tmp_path / "a.npy", pair[0])
+    np.save(tmp_path / "b.npy", pair[1])
+    code = (
+        "import sys, geomoe3d; r = geomoe3d.register(sys.argv[1], sys.argv[2]);"
+        "print(r.T_target_source.tobytes().hex())"
+    )
+    printed = [
+        subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path / "a.npy"), str(tmp_path / "b.npy")],
+            env={**os.environ, "OMP_NUM_THREADS": n, "OPENBLAS_NUM_THREADS": n},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for n in ("1", "2")
+    ]
+    assert len(printed[0].strip()) == 2 * 16 * 8
+    assert printed[0] == printed[1]
+
+
+def test_swapped_roles_give_the_inverse(pair, answer):
+    back = geomoe3d.register(pair[1], pair[0])
+    assert back.status == "ok"
+    assert images_apart(inverse(back.T_target_source), answer.T_target_source, pair[0]) < 0.02
+
+
+def test_national_grid_coordinates_register_as_well_as_the_origin(pair, answer):
+    far = geomoe3d.register(pair[0] + UTM, pair[1] + 2 * UTM)
+    assert far.status == "ok"
+    moved = far.apply(pair[0] + UTM) - 2 * UTM
+    assert np.abs(moved - transform_points(pair[2], pair[0])).max() < 0.03
+    assert np.allclose(far.source.origin, UTM, atol=10)
+
+
+def test_a_billion_units_away(pair):
+    far = geomoe3d.register(pair[0] + 1e9, pair[1] + 1e9)
+    assert far.status == "ok"
+    assert np.abs(far.apply(pair[0] + 1e9) - 1e9 - transform_points(pair[2], pair[0])).max() < 0.03
+
+
+def test_millimetres_on_both_sides(pair, answer):
+    big = geomoe3d.register(1000 * pair[0], 1000 * pair[1])
+    assert big.status == "ok"
+    assert big.voxel_size == pytest.approx(1000 * answer.voxel_size)
+    assert np.abs(big.T_target_source[:3, 3] / 1000 - answer.T_target_source[:3, 3]).max() < 1e-3
+
+
+def test_millimetres_against_metres_is_said_and_not_guessed(pair):
+    result = geomoe3d.register(1000 * pair[0], pair[1])
+    assert result.status == "failed"
+    assert "millimetres" in result.reasons[0]
+    assert np.isnan(result.T_target_source).all()
+    with pytest.raises(InputError, match="no transform"):
+        result.apply(pair[0])
+
+
+def test_the_same_scan_twice_is_the_identity_found_not_assumed(pair):
+    same = geomoe3d.register(pair[0], pair[0])
+    assert same.status == "ok"
+    assert np.abs(same.T_target_source - np.eye(4)).max() < 1e-6
+    moved = geomoe3d.register(pair[0], transform_points(MOTION, pair[0]))
+    assert moved.status == "ok"
+    assert images_apart(moved.T_target_source, MOTION, pair[0]) < 0.01
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_unrelated_scans_are_never_ok(pair, seed):
+    rng = np.random.default_rng(seed)
+    other = np.vstack([box(rng.uniform(0.3, 3, 3), 4000, k) + rng.uniform(-2, 2, 3) for k in range(8)])
+    result = geomoe3d.register(pair[0], other)
+    assert result.status in {"failed", "low_confidence"}
+    assert result.reasons
+    assert result.confidence < 0.9
+
+
+@pytest.mark.parametrize("size", [(1, 1, 1), (1, 2, 3)])
+def test_symmetric_boxes_are_ambiguous_and_show_the_other_motion(size):
+    target = transform_points(MOTION, box(size, 20_000, 1))
+    result = geomoe3d.register(box(size, 20_000, 0), target)
+    assert result.status == "ambiguous"
+    assert result.alternative is not None
+    assert result.alternative.relative_score > 0.8
+    assert result.alternative.rotation_difference_deg > 80
+
+
+def test_surfaces_that_slide_are_never_ok():
+    rng = np.random.default_rng(0)
+    plane = np.c_[rng.uniform(0, 4, (20_000, 2)), rng.normal(0, 0.003, 20_000)]
+    angle = rng.uniform(0, 2 * np.pi, 20_000)
+    cylinder = np.c_[np.cos(angle), np.sin(angle), rng.uniform(0, 3, 20_000)]
+    for points in (plane, cylinder):
+        result = geomoe3d.register(points, transform_points(MOTION, points[::2]))
+        assert result.status != "ok"
+        assert result.confidence <= 0.3
+        assert result.reasons
+
+
+def test_too_few_or_degenerate_points(pair):
+    for count in (0, 1, 2):
+        with pytest.raises(EmptyCloudError):
+            geomoe3d.register(pair[0][:count], pair[1])
+    with pytest.raises(EmptyCloudError, match="all 50 points are equal"):
+        geomoe3d.register(np.ones((50, 3)), pair[1])
+    with pytest.raises(NonFiniteError):
+        geomoe3d.register(np.full((50, 3), np.nan), pair[1])
+    line = np.outer(np.linspace(0, 3, 2000), [1.0, 2.0, 3.0])
+    for source, target in ((line, pair[1]), (pair[0], line), (line, line)):
+        result = geomoe3d.register(source, target)
+        assert result.status == "failed"
+        assert not np.isfinite(result.T_target_source).any()
+    with pytest.raises(EmptyCloudError, match="of 3 points remain"):
+        geomoe3d.register(np.eye(3), np.eye(3) + 1)
+
+
+def test_dirt_is_dropped_and_counted(pair, answer):
+    rng = np.random.default_rng(0)
+    dirty = pair[0].copy()
+    dirty[0] = np.nan
+    dirty[7, 1] = np.inf
+    dirty = np.vstack([dirty, dirty[100:150], pair[0].max(0) + rng.uniform(1.0, 1.5, (1, 3))])
+    result = geomoe3d.register(dirty, pair[1], voxel_size=answer.voxel_size)
+    assert result.status == "ok"
+    assert result.source.num_input == len(dirty)
+    assert result.source.num_non_finite == 2
+    assert result.source.num_duplicates == 50
+    assert result.source.num_isolated >= 1
+    assert images_apart(result.T_target_source, pair[2], pair[0]) < 0.03
+
+
+def test_voxel_size_is_used_reported_and_bounded(pair):
+    assert geomoe3d.register(*pair[:2], voxel_size=0.07).voxel_size == 0.07
+    with pytest.raises(InputError, match="too small"):
+        geomoe3d.register(*pair[:2], voxel_size=1e-8)
+    with pytest.raises(ConfigError, match="voxel_size"):
+        geomoe3d.register(*pair[:2], voxel_size=-1)
+    with pytest.raises(ConfigError, match="voxel_size"):
+        geomoe3d.register(*pair[:2], voxl_size=0.05)
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    ["estimator.name=ransac", "filter.name=spectral", "refinement.method=icp", "matching.method=mutual"],
+)
+def test_other_parts_land_too(pair, assignment):
+    result = Registrar(load_config(None, [assignment])).register(*pair[:2])
+    assert rotation_error_deg(result.T_target_source, pair[2]) < 1
+    assert translation_error(result.T_target_source, pair[2]) < 0.03
+
+
+def test_verification_and_refinement_can_be_switched_off(pair):
+    plain = Registrar(load_config(None, ["verification.enabled=false", "refinement.method=none"]))
+    result = plain.register(*pair[:2])
+    assert rotation_error_deg(result.T_target_source, pair[2]) < 5
+
+
+def test_explanation_shows_what_led_to_the_answer(pair):
+    explained = Registrar().explain(*pair[:2])
+    matched = explained.correspondences
+    assert len(matched) == explained.result.num_correspondences == len(explained.weights)
+    assert explained.inliers.sum() == explained.result.num_inliers
+    assert np.array_equal(matched.source + explained.source.origin, matched.source)
+    assert len(explained.source) == len(pair[0])
+
+
+def test_many_pairs_with_one_registrar(pair, answer):
+    results = list(Registrar().register_many([pair[:2], (pair[1], pair[0])]))
+    assert results[0].T_target_source.tobytes() == answer.T_target_source.tobytes()
+    assert results[1].status == "ok"
+
+
+def test_filter_weighs_anybodys_correspondences(pair):
+    matched = Registrar().explain(*pair[:2]).correspondences
+    weights = Registrar(load_config(None, ["filter.name=spectral"])).filter(matched.points, voxel_size=0.05)
+    true = np.linalg.norm(transform_points(pair[2], matched.source) - matched.target, axis=1) < 0.1
+    assert weights.shape == (len(matched),)
+    assert weights.min() >= 0
+    assert weights.max() == 1
+    assert weights[true].mean() > 3 * weights[~true].mean()
+    with pytest.raises(InputError, match="shape"):
+        Registrar().filter(np.zeros((4, 5)), voxel_size=0.05)
+
+
+def test_progress_names_every_stage_in_order(pair):
+    stages: list[str] = []
+    geomoe3d.register(*pair[:2], progress=stages.append)
+    assert stages == ["load", "prepare", "describe", "match", "weigh", "solve", "verify", "refine"]
+
+
+def test_no_warnings_reach_the_user(pair):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        geomoe3d.register(*pair[:2])
+        geomoe3d.register(np.outer(np.linspace(0, 3, 500), [1.0, 2.0, 3.0]), pair[1])
+
+
+def test_correspondences_are_bounded_however_many_points(pair):
+    explained = Registrar(load_config(None, ["matching.max_correspondences=300"])).explain(*pair[:2])
+    assert isinstance(explained.correspondences, Correspondences)
+    assert len(explained.correspondences) == 300
+    assert explained.correspondences.mutual.all() or explained.correspondences.mutual.sum() < 300

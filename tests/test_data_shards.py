@@ -15,13 +15,14 @@ from geomoe3d.cli.main import geomoe3d
 from geomoe3d.clouds.io import save_points
 from geomoe3d.data import shards as module
 from geomoe3d.data.describe import describe_collection
-from geomoe3d.data.draw import DrawSettings, FragmentPairs
+from geomoe3d.data.draw import DrawSettings, FragmentPool
 from geomoe3d.data.shards import DescribedScene, open_shard, write_shard
 from geomoe3d.data.statistics import by_band, distance, measure, plane_share
 from geomoe3d.data.threedmatch import write_gt_log
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 from geomoe3d.training.augment import AugmentationConfig, augment
+from geomoe3d.training.fragment_pairs import FragmentPairs
 
 
 def surface(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -189,8 +190,8 @@ def test_labels_follow_the_true_motion_and_pairs_are_repeatable(shards: Path) ->
 
 
 def test_every_epoch_has_new_keypoints(shards: Path) -> None:
-    pairs = FragmentPairs(shards)
-    drawn = [pairs.draw(0, np.random.default_rng(k), 300).correspondences[:, :3] for k in range(4)]
+    pool = FragmentPool(shards)
+    drawn = [pool.draw(0, np.random.default_rng(k), 300).correspondences.source for k in range(4)]
     seen = {tuple(row) for points in drawn for row in points.tolist()}
     assert len(seen) > 600
 

@@ -1,7 +1,7 @@
-"""Training pairs drawn fresh from described fragments: new keypoints, new matches, every time.
+"""Pairs drawn fresh from described fragments: new keypoints, new matches, every time.
 
-`FragmentPairs` is a pair dataset as `geomoe3d.training.pairs` defines it: index k always gives the same
-pair of the same keypoints, and there is no end of indices, so no epoch repeats the matches of another.
+Index k of a pool always gives the same pair of the same keypoints, and there is no end of indices, so no
+epoch repeats the matches of another. `geomoe3d.training.fragment_pairs` makes them a training data set.
 A pair is chosen by overlap band first, so that hard pairs come as often as is wanted. About 8 ms per pair
 of 1,000 keypoints on one core.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from geomoe3d.config import MatchingConfig, Section
 from geomoe3d.data.shards import DescribedScene, open_shard, read_meta, shard_folders
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.training.pairs import TrainingPair
-from geomoe3d.types import FloatArray, PreparedCloud
+from geomoe3d.types import BoolArray, Correspondences, FloatArray, PreparedCloud
 
 ENDLESS = 1 << 40
 _TRIES = 4
@@ -57,7 +57,24 @@ PROTOCOL = DrawSettings(usual_share=1.0, band_shares=(1.0,), bands=(0.0, 1.01), 
 """1,000 keypoints of every pair, as the fixed correspondences of the benchmark."""
 
 
-class FragmentPairs:
+@dataclass(frozen=True)
+class DrawnPair:
+    """Matches of one pair of fragments with what is true about them.
+
+    Attributes:
+        correspondences: (N,) nearest neighbours of the keypoints, source to target, metres.
+        labels: (N,) True where the residual under the true motion is below the inlier threshold.
+        T_target_source: (4, 4) true motion.
+        voxel_size: metres.
+    """
+
+    correspondences: Correspondences
+    labels: BoolArray
+    T_target_source: FloatArray
+    voxel_size: float
+
+
+class FragmentPool:
     """Pairs of all shards of a folder, without end.
 
     Args:
@@ -105,7 +122,7 @@ class FragmentPairs:
     def __len__(self) -> int:
         return ENDLESS
 
-    def __getitem__(self, index: int) -> TrainingPair:
+    def __getitem__(self, index: int) -> DrawnPair:
         if not 0 <= index < len(self):
             raise IndexError(f"pair {index} of {len(self)}")
         rng = np.random.default_rng([self.seed, 3, index])
@@ -120,7 +137,7 @@ class FragmentPairs:
         assert pair is not None
         return pair
 
-    def draw(self, number: int, rng: np.random.Generator, keypoints: int | None = None) -> TrainingPair:
+    def draw(self, number: int, rng: np.random.Generator, keypoints: int | None = None) -> DrawnPair:
         """Fresh correspondences of one pair of fragments.
 
         Args:
@@ -172,7 +189,7 @@ def draw_pair(
     keypoints: int,
     inlier_threshold: float,
     rng: np.random.Generator,
-) -> TrainingPair:
+) -> DrawnPair:
     """Nearest neighbours of random keypoints, source to target, with their labels.
 
     Args:
@@ -190,15 +207,8 @@ def draw_pair(
         clouds.append(_cloud(points[rows], features[rows], voxel_size))
     found = match(clouds[0], clouds[1], _MATCHING)
     residual = np.linalg.norm(transform_points(T_target_source, found.source) - found.target, axis=1)
-    return TrainingPair(
-        found.points.astype(np.float32),
-        residual < inlier_threshold * voxel_size,
-        T_target_source,
-        voxel_size,
-        found.feature_distance,
-        found.ratio,
-        found.mutual,
-    )
+    labels: BoolArray = residual < inlier_threshold * voxel_size
+    return DrawnPair(found, labels, T_target_source, voxel_size)
 
 
 _MATCHING = MatchingConfig(method="one_way", neighbors=1, max_correspondences=1_000_000)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.data.draw import PROTOCOL, FragmentPairs
+from geomoe3d.data.draw import PROTOCOL, FragmentPool
 from geomoe3d.data.shards import open_shard, shard_folders
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray
@@ -66,15 +66,15 @@ def measure(
         places += [(scene, k) for k in range(len(scene.start) - 1)]
     kept = np.sort(rng.permutation(len(places))[:max_fragments])
     rows = [_of_fragment(places[k][0].fragment(places[k][1])[0], rng) for k in kept]
-    pairs = FragmentPairs(folder, PROTOCOL, seed)
+    pairs = FragmentPool(folder, PROTOCOL, seed)
     numbers = np.sort(rng.permutation(pairs.num_pairs)[:max_pairs])
     ratios, residuals = [], []
     for number in numbers:
         pair = pairs.draw(int(number), rng, 1000)
         ratios.append(float(pair.labels.mean()))
-        matches = pair.correspondences[pair.labels].astype(np.float64)
-        moved = transform_points(pair.T_target_source, matches[:, :3])
-        residuals.append(np.linalg.norm(moved - matches[:, 3:], axis=1))
+        matches = pair.correspondences.take(pair.labels)
+        moved = transform_points(pair.T_target_source, matches.source)
+        residuals.append(np.linalg.norm(moved - matches.target, axis=1))
     counts, planar, spacing = np.array(rows).T
     return Statistics(
         counts,

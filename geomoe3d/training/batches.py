@@ -24,6 +24,7 @@ from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.inputs import BatchInput, PairInput, collate, pair_input
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
+from geomoe3d.training.fragment_pairs import FragmentPairs
 from geomoe3d.training.losses import network_motion
 from geomoe3d.training.pairs import PairDataset, ShardFolder, TrainingPair
 from geomoe3d.training.synthetic import SyntheticPairs
@@ -63,8 +64,6 @@ def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
     if where == "synthetic":
         return SyntheticPairs(data.synthetic, seed)
     if Path(where).is_dir() and any(is_shard(path) for path in Path(where).iterdir()):
-        from geomoe3d.data.draw import FragmentPairs
-
         return FragmentPairs(where, seed=seed)
     return ShardFolder(where)
 

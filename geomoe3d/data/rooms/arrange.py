@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geomoe3d.data.rooms import pieces
+from geomoe3d.data.rooms import seats, storage
 from geomoe3d.data.rooms.clutter import litter, put_things
 from geomoe3d.data.rooms.models import ModelLibrary
 from geomoe3d.data.rooms.pieces import Maker, Piece
@@ -17,27 +17,27 @@ from geomoe3d.data.rooms.solids import Solids, pose_on_floor
 from geomoe3d.types import FloatArray
 
 MAKERS: dict[str, Maker] = {
-    "bathtub": pieces.bathtub,
-    "bed": pieces.bed,
-    "bookshelf": pieces.bookshelf,
-    "boxes": pieces.boxes,
-    "chair": pieces.chair,
-    "chest": pieces.chest,
-    "coffee table": pieces.coffee_table,
-    "counter": pieces.counter,
-    "desk": pieces.desk,
-    "fridge": pieces.fridge,
-    "lamp": pieces.lamp,
-    "office chair": pieces.office_chair,
-    "picture": pieces.picture,
-    "plant": pieces.plant,
-    "radiator": pieces.radiator,
-    "sofa": pieces.sofa,
-    "table": pieces.table,
-    "toilet": pieces.toilet,
-    "wall shelf": pieces.wall_shelf,
-    "wardrobe": pieces.wardrobe,
-    "washbasin": pieces.washbasin,
+    "bathtub": storage.bathtub,
+    "bed": seats.bed,
+    "bookshelf": storage.bookshelf,
+    "boxes": storage.boxes,
+    "chair": seats.chair,
+    "chest": storage.chest,
+    "coffee table": seats.coffee_table,
+    "counter": storage.counter,
+    "desk": seats.desk,
+    "fridge": storage.fridge,
+    "lamp": storage.lamp,
+    "office chair": seats.office_chair,
+    "picture": storage.picture,
+    "plant": storage.plant,
+    "radiator": storage.radiator,
+    "sofa": seats.sofa,
+    "table": seats.table,
+    "toilet": storage.toilet,
+    "wall shelf": storage.wall_shelf,
+    "wardrobe": storage.wardrobe,
+    "washbasin": storage.washbasin,
 }
 
 # Piece, least and most of it. Earlier ones get the better places.

@@ -43,19 +43,20 @@ class Scene:
 
 
 def generate_scene(
-    rng: np.random.Generator, library: ModelLibrary | None = None, density: tuple[float, float] = (4.0, 20.0)
+    rng: np.random.Generator, library: ModelLibrary | None = None, density: tuple[float, float] = (3.0, 45.0)
 ) -> Scene:
     """A furnished room or flat.
 
     Args:
         rng: decides it.
         library: models to be mixed in, or None for primitives alone.
-        density: range of small things per square metre of table or shelf.
+        density: range of small things per square metre of table or shelf, drawn log-uniformly.
     """
     num_rooms = int(rng.choice([1, 2, 3, 4], p=[0.5, 0.25, 0.15, 0.1]))
     solids = Solids()
     kinds, areas = [], []
-    per_area = float(rng.uniform(*density))
+    # Tidy rooms as often as full ones, so by ratio.
+    per_area = float(np.exp(rng.uniform(*np.log(np.maximum(density, 1e-3)))))
     for room in plan_flat(rng, num_rooms):
         build_shell(rng, solids, room)
         kinds.append(furnish(rng, solids, room, library, per_area))

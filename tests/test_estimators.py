@@ -19,6 +19,7 @@ from geomoe3d.estimators.base import make_estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
 from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
+from geomoe3d.geometry.rigid_fit import spread
 from geomoe3d.geometry.se3 import (
     inverse,
     make_transform,
@@ -397,6 +398,17 @@ def test_rows_that_agree_about_no_length_give_nothing(count: int) -> None:
     rows = np.hstack([source, 10 * source])
     for estimator in (CONSENSUS, RANSAC):
         assert estimator(rows, inlier_threshold=0.01) == []
+
+
+@ROBUST
+def test_inliers_on_a_line_are_no_motion(estimator) -> None:
+    """Twenty true rows on one line leave the turn about it free, whatever the wrong rows look like."""
+    T, wrong = random_motion(1), np.random.default_rng(0).uniform(-5, 5, (8, 6))
+    rows = np.vstack([np.hstack([line(20), transform_points(T, line(20))]), wrong])
+    for h in estimator(rows, inlier_threshold=THRESHOLD):
+        moved = transform_points(h.T_target_source, rows[:, :3])
+        close = np.linalg.norm(moved - rows[:, 3:], axis=1) < THRESHOLD
+        assert spread(rows[close, :3], np.ones(close.sum())) > 0.01 * THRESHOLD
 
 
 GOOD = np.hstack([room_points(np.random.default_rng(0), 10)] * 2)

@@ -71,6 +71,25 @@ def test_posed_folder(tmp_path: Path) -> None:
     assert report.num_pairs == {"pairs": 5}
 
 
+def test_clouds_with_poses(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for k in range(3):
+        np.save(folder / f"scan{k}.npy", cloud(k))
+    np.savetxt(folder / "poses.txt", [motion(k).ravel() for k in range(3)])
+    for root in (tmp_path, folder):
+        collection = open_collection(root)
+        assert (collection.layout, len(collection.pairs)) == ("posed", 3)
+        pair = collection.pairs[1]
+        assert (pair.source.name, pair.target.name) == ("scan0.npy", "scan2.npy")
+        # A point of the world, seen from both: p_fragment = inverse(T_world_fragment) p_world.
+        world = np.array([0.3, -2.0, 1.0, 1.0])
+        seen = inverse(motion(0)) @ world
+        assert np.allclose(pair.T_target_source @ seen, inverse(motion(2)) @ world)
+    np.savetxt(folder / "poses.txt", [motion(k).ravel() for k in range(2)])
+    assert "2 finite poses for 3 clouds" in open_collection(tmp_path).problems[0]
+
+
 def test_evaluation_layout_names_what_the_published_counts_lack(tmp_path: Path) -> None:
     scene = "sun3d-hotel_umd-maryland_hotel3"
     posed_scene(tmp_path / scene)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +152,38 @@ def test_full_disk_leaves_no_half_shard(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(OutputError, match="No space left"):
         describe_collection(tmp_path / "posed", tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+_KILLED = """
+import os, signal, sys
+import numpy as np
+from geomoe3d.data import describe
+real, calls = np.save, []
+def deadly(path, array):
+    calls.append(path)
+    if len(calls) == 9:
+        os.kill(os.getpid(), signal.SIGKILL)
+    real(path, array)
+np.save = deadly
+describe.describe_collection(sys.argv[1], sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+def test_resume_after_sigkill_in_the_middle_of_a_shard(shards: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", _KILLED, str(shards.parent / "posed"), str(out)]
+    ended = subprocess.run(
+        command, capture_output=True, timeout=120, check=False, cwd=Path(__file__).parents[1]
+    )
+    assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
+    assert sorted(p.name for p in out.iterdir()) == [".writing-b", "a"]
+    report = describe_collection(shards.parent / "posed", out)
+    assert (report.made, report.kept) == (1, 1)
+    assert (
+        FragmentPairs(out, verify=True).identity().split(":")[-1]
+        == (FragmentPairs(shards, verify=True).identity().split(":")[-1])
+    )
 
 
 def test_pairs_without_overlap_are_left_out(tmp_path: Path) -> None:

@@ -10,13 +10,14 @@ Layouts:
 - ``evaluation``: the official test set, ``<scene>/cloud_bin_N.ply`` with ``<scene>-evaluation/gt.log``;
 - ``archive``: the training archive of FCGF and PointDSC, ``<scene>@seq-NN_MMM.npz`` with ``*-0.30.txt``;
 - ``predator``: ``train_info.pkl``, ``val_info.pkl``, ``3DMatch.pkl``, ``3DLoMatch.pkl`` with ``.pth`` clouds;
-- ``posed``: any folders of clouds that share a frame through gt.log, which is what ``data fragments`` and
-  ``data synthesize`` write.
+- ``posed``: folders of clouds with gt.log (what ``data fragments`` and ``data synthesize`` write), or with
+  ``poses.txt``: one T_world_fragment of 16 numbers per cloud, in the order of their numbers or names.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +32,12 @@ from geomoe3d.data.threedmatch import (
     true_motion,
 )
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
-from geomoe3d.geometry.se3 import make_transform, project_to_so3
+from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
 from geomoe3d.types import FloatArray, PointCloud
 
 LAYOUTS = ("benchmark", "evaluation", "archive", "predator", "posed")
 _CLOUD_PATTERN = "cloud_bin_*.ply"
+_CLOUD_SUFFIXES = (".ply", ".pcd", ".npy", ".npz", ".xyz", ".las", ".laz", ".e57", ".pth")
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def open_collection(root: str | Path) -> Collection:
     raise InputError(
         f"'{root}' has none of the known layouts: benchmarks/<name>/<scene>/gt.log; "
         "<scene>-evaluation/gt.log; <scene>@seq-NN_MMM.npz with *-0.30.txt; train_info.pkl; "
-        "<scene>/gt.log beside <scene>/cloud_bin_N.ply"
+        "<scene>/gt.log beside <scene>/cloud_bin_N.ply; <scene>/poses.txt beside clouds"
     )
 
 
@@ -183,12 +185,44 @@ def _open_evaluation(collection: Collection) -> None:
 
 def _open_posed(collection: Collection) -> None:
     for folder in _posed_folders(collection.root):
-        _add_scene(collection, folder, folder, "pairs")
+        if (folder / "gt.log").is_file():
+            _add_scene(collection, folder, folder, "pairs")
+        else:
+            _add_by_poses(collection, folder)
 
 
 def _posed_folders(root: Path) -> list[Path]:
     candidates = [root, *sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))]
-    return [p for p in candidates if (p / "gt.log").is_file() and any(p.glob(_CLOUD_PATTERN))]
+    return [
+        p
+        for p in candidates
+        if ((p / "gt.log").is_file() and any(p.glob(_CLOUD_PATTERN)))
+        or ((p / "poses.txt").is_file() and len(_any_clouds(p)) > 1)
+    ]
+
+
+def _any_clouds(folder: Path) -> list[Path]:
+    found = [p for p in folder.iterdir() if p.suffix.lower() in _CLOUD_SUFFIXES and p.is_file()]
+    return sorted(found, key=lambda p: (fragment_number(p), p.name))
+
+
+def _add_by_poses(collection: Collection, folder: Path) -> None:
+    """Every pair of clouds with the motion that their poses give; overlaps are measured later."""
+    clouds = _any_clouds(folder)
+    collection.fragments[folder.name] = clouds
+    path = folder / "poses.txt"
+    try:
+        poses = np.loadtxt(path).reshape(-1, 4, 4)
+    except (OSError, ValueError) as error:
+        collection.problems.append(f"'{path}' holds no poses of 16 numbers: {error}")
+        return
+    if len(poses) != len(clouds) or not np.isfinite(poses).all():
+        collection.problems.append(f"'{path}' holds {len(poses)} finite poses for {len(clouds)} clouds")
+        return
+    motions = [make_transform(project_to_so3(pose[:3, :3]), pose[:3, 3]) for pose in poses]
+    for i, j in combinations(range(len(clouds)), 2):
+        T = inverse(motions[j]) @ motions[i]
+        collection.pairs.append(PosedPair(folder.name, clouds[i], clouds[j], T))
 
 
 def _add_scene(collection: Collection, clouds: Path, truth: Path, group: str) -> None:

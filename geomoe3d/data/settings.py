@@ -27,7 +27,7 @@ class SynthesisSettings(Section):
         12, ge=2, description="depth frames fused into one; stand for 50 recorded ones"
     )
     clutter: tuple[float, float] = Field(
-        (3.0, 45.0), description="range of small things per square metre of table or shelf, log-uniform"
+        (4.0, 60.0), description="range of small things per square metre of table or shelf, log-uniform"
     )
     shares: SceneShares = SceneShares()
     fusion_voxel: float = Field(0.012, gt=0, description="edge of the fusion grid, metres")

@@ -79,8 +79,8 @@ class SensorSettings(Section):
     far: float = 4.5
     baseline: float = 0.075
     disparity_step: float = 0.125
-    disparity_noise: float = 0.12
-    edge_shift: float = 0.7
+    disparity_noise: float = 0.25
+    edge_shift: float = 1.0
     min_slope: float = 0.08
     full_slope: float = 0.25
     hole_share: float = 0.03

@@ -35,10 +35,10 @@ class PreparationConfig(Section):
     normal_neighbors: int = Field(30, ge=3, description="at most so many points fit a normal")
     feature_radius: float = Field(5.0, gt=0, description="neighbourhood of FPFH, in voxels")
     feature_neighbors: int = Field(100, ge=3, description="at most so many points make a feature")
-    viewpoint: Literal["auto", "origin", "centroid"] = Field(
+    viewpoint: Literal["auto", "origin", "guess", "centroid"] = Field(
         "auto",
-        description="where the sensor stood: the file's origin, unknown (normals turn to the centroid), or "
-        "auto: the origin when it lies within one extent of the cloud, else unknown",
+        description="where the sensor stood, to which normals turn: the file's origin, a guess from what can "
+        "be seen, the centroid, or auto: the origin if within one extent of both clouds, else a guess",
     )
 
 

@@ -14,7 +14,8 @@ from geomoe3d.answer import Findings, failed_result, finished_result
 from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.matching import match
-from geomoe3d.clouds.prepare import check_cloud, choose_voxel_size, find_viewpoints, prepare, scale_mismatch
+from geomoe3d.clouds.prepare import check_cloud, choose_voxel_size, prepare, scale_mismatch
+from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
 from geomoe3d.estimators.base import Estimator, make_estimator

@@ -53,10 +53,10 @@ class PreparedCloud:
 
     Attributes:
         points: (n, 3) one representative per occupied voxel, local coordinates.
-        normals: (n, 3) unit normals turned towards ``viewpoint``.
+        normals: (n, 3) unit normals turned towards ``viewpoint``, else to the centroid.
         features: (n, 33) float32 L2-normalised FPFH, or None before description.
         voxel_size: edge of the grid in cloud units.
-        viewpoint: (3,) local position of the sensor, or None where it is not known.
+        viewpoint: (3,) local position of the sensor, known or guessed, or None.
         origin: (3,) float64 shift as in `PointCloud`.
         name: what to call the cloud in messages.
         num_input: points given, before anything was dropped.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
@@ -33,7 +34,8 @@ def prepare(
         cloud: finite points in local coordinates.
         voxel_size: edge of the grid, cloud units.
         config: neighbourhoods in voxels and the limit on points.
-        viewpoint: (3,) local position of the sensor; None turns normals to the cloud's centroid.
+        viewpoint: (3,) local position of the sensor; None guesses it. Where no guess is plausible, or none
+            is wanted (``config.viewpoint`` centroid), normals turn to the cloud's centroid.
         seed: decides which voxels stay when there are more than ``config.max_points``.
 
     Returns:
@@ -58,6 +60,8 @@ def prepare(
             f"needed; give a denser scan or a voxel size that fits it"
         )
     normals = estimate_normals(voxels, radius, config.normal_neighbors)
+    if viewpoint is None and config.viewpoint != "centroid":
+        viewpoint = guess_viewpoint(voxels, normals, 4 * voxel_size, seed=seed)
     towards = voxels.mean(0) if viewpoint is None else viewpoint
     return PreparedCloud(
         points=voxels,
@@ -223,25 +227,3 @@ def orient_normals(points: FloatArray, normals: FloatArray, towards: FloatArray)
     """Normals flipped where they point away from ``towards`` (3,)."""
     away = np.einsum("ij,ij->i", normals, towards - points) < 0
     return np.where(away[:, None], -normals, normals)
-
-
-def find_viewpoints(
-    source: PointCloud, target: PointCloud, rule: str
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """Local positions of the two sensors, or None for both where either is not known.
-
-    Rule ``auto`` believes that a sensor stood at the file's origin when that lies within one extent of the
-    cloud, as it does for depth cameras and single laser scans, and never for georeferenced data.
-    Normals of the two clouds must be turned by the same rule, hence both or none.
-    """
-    if rule == "centroid":
-        return None, None
-    if rule == "auto" and not all(_origin_is_near(c) for c in (source, target)):
-        return None, None
-    return -source.origin, -target.origin
-
-
-def _origin_is_near(cloud: PointCloud) -> bool:
-    low, high = cloud.points.min(0), cloud.points.max(0)
-    outside = np.maximum(np.maximum(low + cloud.origin, -(high + cloud.origin)), 0)
-    return float(np.linalg.norm(outside)) <= float(np.linalg.norm(high - low))

@@ -1,0 +1,112 @@
+"""Where the sensor stood: believed, or guessed from what it can have seen.
+
+Normals have no sign of their own, FPFH needs one, and only the sensor's side of a surface gives it the same
+sign in two scans. Place: prepare. Believing costs nothing; guessing takes about 0.1 s per cloud.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomoe3d.types import BoolArray, FloatArray, PointCloud
+
+_PIXEL_DEG = 3.0
+_NUM_CANDIDATES = 200
+_NUM_KEPT = 4
+_NUM_POINTS = 1500
+_LEAST_VISIBLE = 0.85  # below it the cloud was seen from several sides
+_GRAZING_COSINE = 0.2  # surfaces seen flatter than this return few points to a real sensor
+
+
+def find_viewpoints(
+    source: PointCloud, target: PointCloud, rule: str
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Local positions (3,) of the two sensors, or None for both where either is not known.
+
+    Rule ``auto`` believes that a sensor stood at the file's origin when that lies within one extent of the
+    cloud, as it does for depth cameras and single laser scans, and never for georeferenced data;
+    ``origin`` always; ``guess`` and ``centroid`` never. Normals of the two clouds must be turned by the
+    same rule, hence both or none.
+    """
+    if rule in ("guess", "centroid"):
+        return None, None
+    if rule == "auto" and not all(_origin_is_near(cloud) for cloud in (source, target)):
+        return None, None
+    return -source.origin, -target.origin
+
+
+def _origin_is_near(cloud: PointCloud) -> bool:
+    low, high = cloud.points.min(0), cloud.points.max(0)
+    outside = np.maximum(np.maximum(low + cloud.origin, -(high + cloud.origin)), 0)
+    return float(np.linalg.norm(outside)) <= float(np.linalg.norm(high - low))
+
+
+def guess_viewpoint(
+    points: FloatArray, normals: FloatArray, margin: float, *, seed: int = 0
+) -> FloatArray | None:
+    """The place from which nearly all of a cloud can have been seen, (3,) in its frame, or None.
+
+    A sensor sees no point through another, and hardly any at a grazing angle. Random places around the
+    cloud are scored by both, and the best are improved by a random search. On depth-camera fragments the
+    guess lies one to two metres off, yet turns some 96 % of the normals as the true place does (the
+    centroid: 76 %). A cloud that was seen from all sides mostly has no such place.
+
+    Args:
+        points: (N, 3), at least one.
+        normals: (N, 3) unit, of any sign.
+        margin: points this much farther than another in the same direction count as hidden.
+        seed: decides places and points looked at.
+    """
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(len(points))[:_NUM_POINTS]
+    points, normals = points[chosen], normals[chosen]
+    low, high = points.min(0), points.max(0)
+    half = (high - low) / 2
+    step = 0.15 * float(np.linalg.norm(half))
+    places = (low + high) / 2 + rng.uniform(-1, 1, (_NUM_CANDIDATES, 3)) * (1.3 * half + step)
+    scores = np.array([_plausibility(place, points, normals, margin) for place in places])
+    order = np.argsort(-scores, kind="stable")[:_NUM_KEPT]
+    best, best_scores = places[order], scores[order]
+    for _ in range(4):
+        for k in range(len(best)):
+            for trial in best[k] + rng.normal(0, step, (8, 3)):
+                score = _plausibility(trial, points, normals, margin)
+                if score > best_scores[k]:
+                    best[k], best_scores[k] = trial, score
+        step /= 1.7
+    found: FloatArray = best[best_scores.argmax()]
+    directions, distance, _ = _view(found, points, normals)
+    return found if _not_hidden(directions, distance, margin).mean() >= _LEAST_VISIBLE else None
+
+
+def _plausibility(place: FloatArray, points: FloatArray, normals: FloatArray, margin: float) -> float:
+    """Share of points not hidden, plus mean |cosine| of incidence, minus the share at a grazing angle."""
+    directions, distance, cosine = _view(place, points, normals)
+    visible = _not_hidden(directions, distance, margin)
+    return float(visible.mean() + cosine.mean() - (cosine < _GRAZING_COSINE).mean())
+
+
+def _view(
+    place: FloatArray, points: FloatArray, normals: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Unit directions (N, 3), distances (N,) and |cosine| of incidence (N,) of points from a place."""
+    rays = points - place
+    distance = np.maximum(np.sqrt(np.einsum("ij,ij->i", rays, rays)), 1e-12)
+    directions = rays / distance[:, None]
+    return directions, distance, np.abs(np.einsum("ij,ij->i", directions, normals))
+
+
+def _not_hidden(directions: FloatArray, distance: FloatArray, margin: float) -> BoolArray:
+    """True where no point in the same pixel of a cube map around the place is nearer by ``margin``."""
+    size = round(90 / _PIXEL_DEG)
+    axis = np.abs(directions).argmax(1)
+    rows = np.arange(len(directions))
+    major = directions[rows, axis]
+    others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    plane = np.take_along_axis(directions, others, 1) / np.abs(major)[:, None]
+    cell = np.minimum(((plane + 1) / 2 * size).astype(np.int64), size - 1)
+    pixel = ((2 * axis + (major > 0)) * size + cell[:, 0]) * size + cell[:, 1]
+    nearest = np.full(6 * size * size, np.inf)
+    np.minimum.at(nearest, pixel, distance)
+    visible: BoolArray = distance < nearest[pixel] + margin
+    return visible

@@ -1,0 +1,226 @@
+"""Configurations: strict about keys, lenient about numbers, overridden by assignments, never changed."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from geomoe3d.config import (
+    RegistrationConfig,
+    Section,
+    build_config,
+    known_keys,
+    load_config,
+    read_yaml,
+    set_keys,
+)
+from geomoe3d.errors import ConfigError
+
+KEYS = known_keys(RegistrationConfig)
+
+
+def leaf(config: Section, key: str) -> Any:
+    value: Any = config
+    for part in key.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def test_every_leaf_is_known_once_and_can_be_read() -> None:
+    assert len(KEYS) == len(set(KEYS))
+    assert {"voxel_size", "seed", "estimator.inlier_threshold", "matching.method"} <= set(KEYS)
+    tree = RegistrationConfig().model_dump()
+
+    def leaves(node: dict[str, Any], prefix: str = "") -> set[str]:
+        return {
+            name
+            for key, value in node.items()
+            for name in (leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key})
+        }
+
+    assert leaves(tree) == set(KEYS)
+    for key in KEYS:
+        leaf(RegistrationConfig(), key)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_default_can_be_assigned_to_itself(key: str) -> None:
+    """The value as YAML writes it passes the key's own limits and changes nothing."""
+    text = yaml.safe_dump(leaf(RegistrationConfig(), key)).splitlines()[0]
+    assert load_config(None, [f"{key}={text}"]) == RegistrationConfig()
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_misspelt_key_names_the_right_one(key: str) -> None:
+    *parents, name = key.split(".")
+    wrong = ".".join([*parents, name[:-2] + name[-1]])  # the last letter but one is missing
+    with pytest.raises(ConfigError, match=f"unknown key '{wrong}'; did you mean '{key}'"):
+        load_config(None, [f"{wrong}=1"])
+
+
+def test_a_key_without_its_section_is_found() -> None:
+    with pytest.raises(ConfigError, match=r"did you mean 'estimator.inlier_threshold'"):
+        load_config(None, ["inlier_threshold=1"])
+    with pytest.raises(ConfigError, match=r"known keys: voxel_size, seed"):
+        load_config(None, ["qqqq=1"])
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    [
+        "voxel_size=0",
+        "voxel_size=-1",
+        "voxel_size=.nan",
+        "voxel_size=.inf",
+        "voxel_size=small",
+        "seed=-1",
+        "seed=1.5",
+        "matching.method=both",
+        "matching.neighbors=0",
+        "matching.neighbors=11",
+        "matching.max_correspondences=2",
+        "matching.max_ratio=1.1",
+        "estimator.ransac_confidence=1",
+        "estimator.inlier_threshold=0",
+        "estimator.name=kabsch",
+        "judgement.min_confidence=1.01",
+        "preparation.voxel_points=199",
+        "verification.enabled=perhaps",
+        "estimator=5",
+        "estimator=",
+        "refinement.max_iterations=[1]",
+    ],
+)
+def test_values_out_of_range_are_named_with_their_value(assignment: str) -> None:
+    key, _, text = assignment.partition("=")
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [assignment])
+    assert f"'{key}" in str(caught.value)
+    assert repr(yaml.safe_load(text)) in str(caught.value)
+
+
+def test_two_mistakes_are_both_told() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, ["voxel_sise=1", "seed=-3"])
+    assert "'voxel_sise'" in str(caught.value)
+    assert "'seed' = -3" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "expected"),
+    [("voxel_size=1", 1.0), ("voxel_size=1e-3", 0.001), ("voxel_size=null", None), ("seed=3.0", 3)],
+)
+def test_numbers_are_taken_however_they_are_written(assignment: str, expected: float | None) -> None:
+    value = leaf(load_config(None, [assignment]), assignment.partition("=")[0])
+    assert value == expected
+    assert type(value) is type(expected)
+
+
+def test_a_configuration_does_not_change() -> None:
+    config = RegistrationConfig()
+    with pytest.raises(ValidationError):
+        config.seed = 3  # type: ignore[misc]
+    with pytest.raises(ValidationError):
+        config.estimator.name = "svd"  # type: ignore[misc]
+    assert hash(config) == hash(RegistrationConfig())
+
+
+# ---- assignments and files ------------------------------------------------------------------------------
+
+names = st.sampled_from(["a", "b", "c"])
+trees = st.recursive(st.integers(), lambda inner: st.dictionaries(names, inner, max_size=3), max_leaves=8)
+
+
+@given(st.dictionaries(names, trees, max_size=3), st.lists(names, min_size=1, max_size=3), st.integers())
+@settings(max_examples=60, deadline=None)
+def test_an_assignment_changes_one_leaf_of_a_copy(tree: dict[str, Any], path: list[str], value: int) -> None:
+    before = copy.deepcopy(tree)
+    node: Any = tree
+    blocked = False
+    for name in path[:-1]:
+        node = node.get(name, {})
+        if not isinstance(node, dict):
+            blocked = True
+            break
+    assignment = f"{'.'.join(path)}={value}"
+    if blocked:
+        with pytest.raises(ConfigError, match="holds a value, not a section"):
+            set_keys(tree, [assignment])
+    else:
+        changed = set_keys(tree, [assignment])
+        node = changed
+        for name in path[:-1]:
+            node = node[name]
+        assert node.pop(path[-1]) == value
+        node = before_pruned = copy.deepcopy(before)
+        for name in path[:-1]:
+            node = node.setdefault(name, {})
+        node.pop(path[-1], None)
+        assert changed == before_pruned
+    assert tree == before
+
+
+def test_later_assignments_win_and_values_may_hold_an_equals_sign() -> None:
+    assert set_keys({}, ["a=1", "a=2"]) == {"a": 2}
+    assert set_keys({}, ["a.b = x=y"]) == {"a": {"b": "x=y"}}
+    assert set_keys({"a": {"b": 1}}, ["a.c=[1, 2]"]) == {"a": {"b": 1, "c": [1, 2]}}
+
+
+@pytest.mark.parametrize("text", ["", "seed", "=3", " =3"])
+def test_what_is_no_assignment_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="write key=value"):
+        set_keys({}, [text])
+
+
+def test_values_that_are_no_yaml_are_refused() -> None:
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        set_keys({}, ["a=[1"])
+
+
+def test_files_and_assignments_combine(tmp_path) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text("seed: 3\nestimator:\n  name: ransac\n  inlier_threshold: 3\n")
+    config = load_config(path, ["estimator.inlier_threshold=1.5"])
+    assert (config.seed, config.estimator.name, config.estimator.inlier_threshold) == (3, "ransac", 1.5)
+    assert config.matching == RegistrationConfig().matching
+    path.write_text("# nothing but a comment\n")
+    assert load_config(path) == RegistrationConfig() == load_config()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("- 1\n- 2\n", "holds a list"), ("a: [", "not valid YAML"), ("just words", "holds a str")],
+)
+def test_files_that_hold_no_mapping_are_refused(tmp_path, text: str, message: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=f"bad.yaml.*{message}"):
+        read_yaml(path)
+
+
+def test_files_that_cannot_be_read_are_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot read.*none.yaml.*No such file"):
+        read_yaml(tmp_path / "none.yaml")
+    with pytest.raises(ConfigError, match="cannot read"):
+        read_yaml(tmp_path)
+    (tmp_path / "latin.yaml").write_bytes(b"name: \xff\xfe\xe9")
+    with pytest.raises(ConfigError, match=r"latin.yaml.*not valid YAML"):
+        read_yaml(tmp_path / "latin.yaml")
+
+
+def test_only_mappings_build_a_configuration() -> None:
+    assert build_config(RegistrationConfig, None) == build_config(RegistrationConfig, {})
+    with pytest.raises(ConfigError, match=r"my place: expected a mapping.*list"):
+        build_config(RegistrationConfig, [1], "my place")  # type: ignore[arg-type]
+
+
+def test_a_dumped_configuration_builds_the_same() -> None:
+    config = load_config(None, ["voxel_size=0.3", "filter.name=spectral", "verification.enabled=false"])
+    assert build_config(RegistrationConfig, config.model_dump(mode="json")) == config
+    assert build_config(RegistrationConfig, yaml.safe_load(yaml.safe_dump(config.model_dump()))) == config

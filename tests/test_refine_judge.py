@@ -1,0 +1,377 @@
+"""Refinement, the information of a fit, and the judgement: documented rules, derivatives, monotony."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from geomoe3d.answer import Findings
+from geomoe3d.clouds.prepare import prepare
+from geomoe3d.config import JudgementConfig, PreparationConfig, RefinementConfig
+from geomoe3d.geometry.se3 import (
+    inverse,
+    make_transform,
+    rotation_error_deg,
+    transform_points,
+    translation_error,
+)
+from geomoe3d.judge import Information, confidence_score, judge, lead_over, measure_information
+from geomoe3d.refine import refine
+from geomoe3d.stages import StageClock
+from geomoe3d.types import Correspondences, PointCloud, PreparedCloud
+from geomoe3d.verification import Evidence
+
+VOXEL = 0.1
+METHODS = ["icp", "gicp"]
+
+
+def perturbation(rotation: np.ndarray, translation: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """p -> exp(rotation) (p - center) + center + translation."""
+    R = Rotation.from_rotvec(rotation).as_matrix()
+    return make_transform(R, center + translation - R @ center)
+
+
+def surfaces(kind: str, seed: int = 0, count: int = 12_000) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 3, (count, 3))
+    if kind == "corner":
+        points[np.arange(count), rng.integers(0, 3, count)] = 0
+    elif kind == "plane":
+        points[:, 2] = 0
+    elif kind == "channel":  # two planes: slides along their common line
+        points[np.arange(count), rng.integers(0, 2, count)] = 0
+    elif kind == "cylinder":
+        angle = rng.uniform(0, 2 * np.pi, count)
+        points[:, 0], points[:, 1] = np.cos(angle), np.sin(angle)
+    elif kind == "sphere":
+        points = points - 1.5
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return points
+
+
+def prepared(points: np.ndarray, voxel: float = VOXEL) -> PreparedCloud:
+    return prepare(PointCloud(points), voxel, PreparationConfig())
+
+
+def motion(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return make_transform(Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3) * 3)
+
+
+def pair(kind: str = "corner", seed: int = 0) -> tuple[PreparedCloud, PreparedCloud, np.ndarray]:
+    """Two samples of one surface, and the motion between them."""
+    T = motion(seed + 1)
+    source, target = surfaces(kind, 2 * seed), surfaces(kind, 2 * seed + 1)
+    return prepared(source), prepared(transform_points(T, target)), T
+
+
+# ---- refinement -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("seed", range(3))
+def test_refinement_finds_the_motion_from_nearby(method: str, seed: int) -> None:
+    source, target, T = pair(seed=seed)
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    centre = transform_points(T, source.points.mean(0)[None])[0]
+    start = perturbation(np.radians(2) * axis / np.linalg.norm(axis), rng.normal(size=3) * 0.03, centre) @ T
+    refined, note = refine(start, source, target, RefinementConfig(method=method))
+    assert note is None
+    assert rotation_error_deg(refined, T) < 0.2 < rotation_error_deg(start, T)
+    assert translation_error(refined, T) < 0.02
+    np.testing.assert_allclose(refined[:3, :3] @ refined[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(refined[:3, :3]) == pytest.approx(1)
+    np.testing.assert_array_equal(refined[3], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_refinement_does_not_mind_the_unit(method: str, scale: float) -> None:
+    T = motion(1)
+    a, b = surfaces("corner", 0), transform_points(T, surfaces("corner", 1))
+    start = perturbation(np.radians([1.0, -1, 1]), np.full(3, 0.02), b.mean(0)) @ T
+    config = RefinementConfig(method=method)
+    plain, _ = refine(start, prepared(a), prepared(b), config)
+    scaled_start = start.copy()
+    scaled_start[:3, 3] *= scale
+    scaled, note = refine(
+        scaled_start, prepared(a * scale, VOXEL * scale), prepared(b * scale, VOXEL * scale), config
+    )
+    assert note is None
+    assert rotation_error_deg(plain, scaled) < 0.01
+    np.testing.assert_allclose(scaled[:3, 3] / scale, plain[:3, 3], atol=1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_refinement_gives_the_same_bytes_twice_and_changes_no_input(method: str) -> None:
+    source, target, T = pair()
+    start, points = T.copy(), source.points.copy()
+    config = RefinementConfig(method=method)
+    a, b = (refine(start, source, target, config)[0] for _ in range(2))
+    assert a.tobytes() == b.tobytes()
+    np.testing.assert_array_equal(start, T)
+    np.testing.assert_array_equal(source.points, points)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_where_nothing_matches_the_start_is_given_with_a_reason(method: str) -> None:
+    source, target, T = pair()
+    start = perturbation(np.zeros(3), np.array([100.0, 0, 0]), np.zeros(3)) @ T
+    found, note = refine(start, source, target, RefinementConfig(method=method))
+    np.testing.assert_array_equal(found, start)
+    assert re.search(r"found only 0 matching points \(it needs 10\)", note)
+
+
+def test_a_refinement_that_slides_away_is_thrown_away() -> None:
+    """On a plane's edge with a huge reach the source is drawn far from where it was put."""
+    source, target, T = pair()
+    start = perturbation(np.radians([0.0, 0, 25]), np.zeros(3), np.zeros(3)) @ T
+    found, note = refine(start, source, target, RefinementConfig(max_distance=50, max_iterations=200))
+    np.testing.assert_array_equal(found, start)
+    assert re.search(r"slid away by [\d.]+ deg and [\d.]+ voxels", note)
+
+
+def test_no_refinement_gives_the_very_start() -> None:
+    source, target, T = pair()
+    assert refine(T, source, target, RefinementConfig(method="none")) == (T, None)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("count", [3, 5, 12])
+def test_tiny_clouds_do_not_bring_refinement_down(method: str, count: int) -> None:
+    points = np.random.default_rng(count).uniform(0, 0.3, (count, 3))
+    tiny = PreparedCloud(points, np.tile([0.0, 0, 1], (count, 1)), None, VOXEL, None, np.zeros(3))
+    found, note = refine(np.eye(4), tiny, tiny, RefinementConfig(method=method))
+    assert np.isfinite(found).all()
+    assert note is not None or count >= 10
+    np.testing.assert_allclose(found, np.eye(4), atol=1e-3)
+
+
+# ---- the information of a fit ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "free"), [("plane", 3), ("channel", 1), ("cylinder", 2), ("sphere", 3), ("corner", 0)]
+)
+def test_surfaces_that_slide_have_as_many_zero_eigenvalues(kind: str, free: int) -> None:
+    cloud = prepared(surfaces(kind))
+    centre = {"cylinder": np.zeros(3), "sphere": np.zeros(3)}.get(kind)
+    if centre is not None:  # the fitted normals of a curved patch are not quite exact
+        normals = cloud.points * ([1, 1, 0] if kind == "cylinder" else [1, 1, 1])
+        cloud = replace(cloud, normals=normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    inner = (cloud.points > 0.4).sum(1) >= {"corner": 2, "channel": 2}.get(kind, 0)  # clear of the edges
+    cloud = replace(cloud, points=cloud.points[inner], normals=cloud.normals[inner])
+    information = measure_information(np.eye(4), cloud, cloud, VOXEL)
+    values = np.linalg.eigvalsh(information.matrix)
+    assert (values < 1e-6 * values[-1]).sum() == free
+    assert (information.observability > 0.01) == (free == 0)
+    assert information.num_matched == len(cloud)
+    np.testing.assert_allclose(information.center, cloud.points.mean(0), atol=1e-12)
+
+
+def test_the_matrix_is_the_curvature_of_the_point_to_plane_cost() -> None:
+    """Finite differences of the gaps, matches held fixed, give the same matrix and predict the cost."""
+    source, target, T = pair(seed=2)
+    information = measure_information(T, source, target, VOXEL)
+    moved = transform_points(T, source.points)
+    distance, nearest = cKDTree(target.points).query(moved)
+    hit = distance < VOXEL
+    points, planes, normals = moved[hit], target.points[nearest[hit]], target.normals[nearest[hit]]
+    gaps = ((points - planes) * normals).sum(1)
+    variance = max((gaps**2).mean(), (0.1 * VOXEL) ** 2)
+
+    def jacobian_column(k: int, h: float = 1e-6) -> np.ndarray:
+        values = []
+        for step in (h, -h):
+            xi = step * np.eye(6)[k]
+            P = perturbation(xi[:3], xi[3:], information.center)
+            values.append(((transform_points(P, points) - planes) * normals).sum(1))
+        return (values[0] - values[1]) / (2 * h)
+
+    J = np.column_stack([jacobian_column(k) for k in range(6)])
+    np.testing.assert_allclose(information.matrix, J.T @ J / variance, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(information.matrix, information.matrix.T, rtol=1e-12)
+    # And it predicts how the cost grows, to first and second order, for perturbations in any direction.
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        xi = rng.normal(size=6) * 1e-4
+        P = perturbation(xi[:3], xi[3:], information.center)
+        cost = (((transform_points(P, points) - planes) * normals).sum(1) ** 2).sum() / variance
+        growth = cost - (gaps @ gaps + 2 * gaps @ J @ xi) / variance
+        assert growth == pytest.approx(xi @ information.matrix @ xi, rel=0.02)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_information_follows_the_unit_and_observability_does_not(scale: float) -> None:
+    T = motion(3)
+    a, b = surfaces("corner", 0), transform_points(T, surfaces("corner", 1))
+    T_scaled = T.copy()
+    T_scaled[:3, 3] *= scale
+    plain = measure_information(T, prepared(a), prepared(b), VOXEL)
+    scaled = measure_information(
+        T_scaled, prepared(a * scale, VOXEL * scale), prepared(b * scale, VOXEL * scale), VOXEL * scale
+    )
+    assert scaled.observability == pytest.approx(plain.observability, rel=0.02)
+    units = np.array([scale] * 3 + [1.0] * 3)  # a radian moves a point by its radius
+    np.testing.assert_allclose(
+        scaled.matrix / np.outer(units, units) * scale**2,
+        plain.matrix,
+        rtol=0.02,
+        atol=0.02 * plain.matrix[0, 0],
+    )
+
+
+def test_observability_ignores_where_the_pair_lies_and_how_it_is_turned() -> None:
+    source, target, T = pair(seed=4)
+    A = motion(9)
+    A[:3, 3] *= 100
+    moved = replace(target, points=transform_points(A, target.points), normals=target.normals @ A[:3, :3].T)
+    a, b = (
+        measure_information(T, source, target, VOXEL),
+        measure_information(A @ T, source, moved, VOXEL),
+    )
+    assert a.observability == pytest.approx(b.observability, rel=1e-6)
+    np.testing.assert_allclose(b.center, transform_points(A, a.center[None])[0], atol=1e-9)
+    turn = np.kron(np.eye(2), A[:3, :3])
+    np.testing.assert_allclose(b.matrix, turn @ a.matrix @ turn.T, rtol=1e-6, atol=1e-3 * abs(a.matrix).max())
+
+
+def test_too_few_matches_hold_no_information() -> None:
+    source, target, T = pair()
+    far = perturbation(np.zeros(3), np.array([50.0, 0, 0]), np.zeros(3)) @ T
+    information = measure_information(far, source, target, VOXEL)
+    assert information.num_matched == 0
+    assert information.observability == 0
+    assert np.isnan(information.matrix).all()
+    assert np.isnan(information.center).all()
+
+
+# ---- judgement ------------------------------------------------------------------------------------------
+
+FIRM = Information(np.eye(6), np.zeros(3), 0.1, 500)
+LOOSE = Information(np.eye(6), np.zeros(3), 0.0, 500)
+
+
+def evidence(score: float, overlap: float = 0.6, violation: float = 0.0) -> Evidence:
+    return Evidence(overlap, overlap, score * np.exp(10 * violation), violation)
+
+
+def test_strong_evidence_with_a_lead_is_ok() -> None:
+    judged = judge(evidence(0.8), 5.0, FIRM, JudgementConfig())
+    assert judged.status == "ok"
+    assert judged.reasons == ()
+    assert judged.confidence > 0.9
+
+
+def test_weak_evidence_is_low_confidence_and_says_so() -> None:
+    judged = judge(evidence(0.05), 1.5, FIRM, JudgementConfig())
+    assert judged.status == "low_confidence"
+    assert judged.confidence < 0.9
+    assert any(re.search(r"confidence 0\.\d\d is below 0\.90", reason) for reason in judged.reasons)
+
+
+def test_a_rival_about_as_good_is_ambiguous() -> None:
+    judged = judge(evidence(0.8), 1.1, FIRM, JudgementConfig())
+    assert judged.status == "ambiguous"
+    assert judged.confidence <= 0.5
+    assert any("91 %" in reason for reason in judged.reasons)
+    limit = 1 / JudgementConfig().ambiguity_ratio
+    assert judge(evidence(2.0), limit * 1.001, FIRM, JudgementConfig()).status != "ambiguous"
+    assert judge(evidence(2.0), limit * 0.999, FIRM, JudgementConfig()).status == "ambiguous"
+    # Where even without a rival nothing would be believed, the rival is not the reason.
+    assert judge(evidence(0.02), 1.1, FIRM, JudgementConfig()).status == "low_confidence"
+
+
+def test_a_surface_that_slides_is_ambiguous_whatever_the_evidence() -> None:
+    for score, lead in ((5.0, 30.0), (0.01, 1.0)):
+        judged = judge(evidence(score), lead, LOOSE, JudgementConfig())
+        assert judged.status == "ambiguous"
+        assert judged.confidence <= 0.3
+        assert any("slide" in reason for reason in judged.reasons)
+
+
+def test_little_overlap_and_violated_free_space_are_told_even_when_ok() -> None:
+    judged = judge(evidence(2.0, overlap=0.09), 10.0, FIRM, JudgementConfig())
+    assert judged.status == "ok"
+    assert any("overlap 9 %" in reason for reason in judged.reasons)
+    judged = judge(evidence(2.0, violation=0.12), 10.0, FIRM, JudgementConfig())
+    assert any("free space" in reason and "0.12" in reason for reason in judged.reasons)
+
+
+def test_nothing_scored_is_never_ok() -> None:
+    for lead in (1.0, 3.0, np.inf):
+        judged = judge(evidence(0.0), lead, FIRM, JudgementConfig())
+        assert judged.status == "low_confidence"
+        assert judged.confidence == 0
+
+
+@pytest.mark.parametrize("least", [0.0, 0.5, 0.99])
+def test_the_threshold_is_the_users(least: float) -> None:
+    for score, lead in itertools.product((0.05, 0.2, 0.5, 2.0), (1.5, 5.0)):
+        judged = judge(evidence(score), lead, FIRM, JudgementConfig(min_confidence=least))
+        assert (judged.status == "ok") == (judged.confidence >= least)
+
+
+def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
+    scores, leads = np.geomspace(1e-6, 50, 40), [*np.geomspace(0.5, 30, 20), np.inf]
+    table = np.array([[confidence_score(s, x) for x in leads] for s in scores])
+    assert ((table >= 0) & (table <= 1)).all()
+    assert (np.diff(table, axis=0) >= 0).all()
+    assert (np.diff(table, axis=1) >= 0).all()
+    assert table[0, 0] < 0.001
+    assert table[-1, -1] > 0.999
+    assert confidence_score(0.0, np.inf) == confidence_score(-1.0, 5.0) == 0
+
+
+def test_lead_over_the_other() -> None:
+    assert lead_over(evidence(0.6), evidence(0.2)) == pytest.approx(3)
+    assert lead_over(evidence(0.2), evidence(0.6)) == pytest.approx(1 / 3)
+    assert lead_over(evidence(0.6), evidence(0.0)) == np.inf
+    assert lead_over(evidence(0.0), evidence(0.0)) == 1
+    assert lead_over(evidence(0.0), None) == 1
+    # An answer without a rival has beaten none: more than a tie, less than a clear victory.
+    assert 1 < lead_over(evidence(0.6), None) < 10
+
+
+# ---- findings and the clock ------------------------------------------------------------------------------
+
+
+def test_nothing_found_holds_no_transform() -> None:
+    nothing = Findings.nothing("no motion")
+    assert np.isnan(nothing.T_target_source).all()
+    assert nothing.judgement.status == "failed"
+    assert nothing.judgement.confidence == 0
+    assert nothing.judgement.reasons == ("no motion",)
+    residuals = nothing.residuals(Correspondences(np.zeros((4, 6))))
+    assert (residuals == np.inf).all()
+    assert residuals.shape == (4,)
+
+
+def test_residuals_are_distances_after_the_motion() -> None:
+    T, rng = motion(5), np.random.default_rng(5)
+    source, gaps = rng.normal(size=(6, 3)), rng.normal(size=(6, 3))
+    rows = Correspondences(np.hstack([source, transform_points(T, source) + gaps]))
+    found = replace(Findings.nothing(""), T_target_source=T, evidence=evidence(1.0))
+    np.testing.assert_allclose(found.residuals(rows), np.linalg.norm(gaps, axis=1))
+    exchanged = Correspondences(rows.points[:, [3, 4, 5, 0, 1, 2]])
+    back = replace(found, T_target_source=inverse(T))
+    np.testing.assert_allclose(back.residuals(exchanged), np.linalg.norm(gaps, axis=1))
+
+
+def test_the_clock_adds_up_and_tells_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = iter([0.0, 1.0, 3.0, 6.0, 10.0])
+    monkeypatch.setattr("geomoe3d.stages.time.perf_counter", lambda: next(ticks))
+    told: list[str] = []
+    clock = StageClock(told.append)
+    clock("load")
+    clock("solve")
+    clock("load")
+    assert clock.stop() == {"load": 2.0 + 4.0, "solve": 3.0, "total": 10.0}
+    assert told == ["load", "solve", "load"]

@@ -60,7 +60,10 @@ class MatchingConfig(Section):
 class FilterConfig(Section):
     """What weighs the correspondences before estimation."""
 
-    name: str = Field("none", description="none | spectral, or a filter registered later")
+    name: str = Field("none", description="none, spectral (needs no training), or geomoe (the network)")
+    weights: str | None = Field(
+        None, description="trained weights of geomoe: a .safetensors file or a shipped name"
+    )
 
 
 class EstimatorConfig(Section):

@@ -67,8 +67,23 @@ class Registrar:
 
     def __init__(self, config: RegistrationConfig | None = None) -> None:
         self.config = config or RegistrationConfig()
-        self._filter: Filter = make_filter(self.config.filter.name)
+        self._filter: Filter = make_filter(self.config.filter.name, self.config.filter.weights)
         self._estimator: Estimator = make_estimator(self.config.estimator)
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str, config: RegistrationConfig | None = None) -> Registrar:
+        """A registrar whose correspondences are weighed by a trained network.
+
+        Args:
+            name_or_path: a .safetensors file with its card, or the name of shipped weights.
+            config: the rest of the configuration; None takes the defaults.
+
+        Raises:
+            CheckpointError: the weights are missing, broken or do not fit.
+        """
+        tree = (config or RegistrationConfig()).model_dump()
+        tree["filter"] = {"name": "geomoe", "weights": str(name_or_path)}
+        return cls(build_config(RegistrationConfig, tree, "Registrar.from_pretrained"))
 
     def register(self, source: Any, target: Any, *, progress: Progress | None = None) -> RegistrationResult:
         """The rigid motion that lays source on target; see `geomoe3d.register`."""

@@ -35,6 +35,7 @@ class _Outputs:
 @click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
 @click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [none]")
+@click.option("--weights", metavar="FILE", help="Trained weights of the filter geomoe (.safetensors).")
 @click.option("--estimator", metavar="NAME", help="consensus, ransac or svd. [consensus]")
 @click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
@@ -56,6 +57,7 @@ def command(
     config_file: str | None,
     assignments: tuple[str, ...],
     filter_name: str | None,
+    weights: str | None,
     estimator: str | None,
     inverse: bool,
     as_json: bool,
@@ -79,6 +81,7 @@ def command(
         "voxel_size": voxel_size,
         "seed": seed,
         "filter.name": filter_name,
+        "filter.weights": weights,
         "estimator.name": estimator,
     }
     given = [f"{key}={value}" for key, value in named.items() if value is not None]

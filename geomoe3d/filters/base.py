@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from geomoe3d.errors import ConfigError
+from geomoe3d.errors import ConfigError, DependencyError
 from geomoe3d.types import Correspondences, FloatArray, IntArray
 
 
@@ -59,17 +59,32 @@ class NoFilter:
         return FilterOutput(np.ones(len(correspondences)))
 
 
-def _none() -> Filter:
+def _none(weights: str | None) -> Filter:
     return NoFilter()
 
 
-def _spectral() -> Filter:
+def _spectral(weights: str | None) -> Filter:
     from geomoe3d.filters.spectral import SpectralFilter
 
     return SpectralFilter()
 
 
-_FACTORIES: dict[str, Callable[[], Filter]] = {"none": _none, "spectral": _spectral}
+def _geomoe(weights: str | None) -> Filter:
+    try:
+        from geomoe3d.filters.geomoe_filter import geomoe_filter
+    except ImportError as error:
+        raise DependencyError(
+            f"the filter 'geomoe' needs PyTorch and safetensors ({error}); `geomoe3d doctor` gives the "
+            "command that installs them, or use --filter none"
+        ) from error
+    return geomoe_filter(weights)
+
+
+_FACTORIES: dict[str, Callable[[str | None], Filter]] = {
+    "none": _none,
+    "spectral": _spectral,
+    "geomoe": _geomoe,
+}
 
 
 def filter_names() -> list[str]:
@@ -77,14 +92,20 @@ def filter_names() -> list[str]:
     return list(_FACTORIES)
 
 
-def make_filter(name: str) -> Filter:
+def make_filter(name: str, weights: str | None = None) -> Filter:
     """The filter of a given name.
+
+    Args:
+        name: one of `filter_names`.
+        weights: file or name of trained weights, for filters that have any; None takes the shipped ones.
 
     Raises:
         ConfigError: no filter has this name; the message gives the nearest one.
+        CheckpointError: the weights are missing, broken or do not fit.
+        DependencyError: a library that the filter needs is not installed.
     """
     if name in _FACTORIES:
-        return _FACTORIES[name]()
+        return _FACTORIES[name](weights)
     close = difflib.get_close_matches(name, _FACTORIES, n=1, cutoff=0.4)
     hint = f"did you mean '{close[0]}'?" if close else "known: " + ", ".join(_FACTORIES)
     raise ConfigError(f"unknown filter '{name}'; {hint}")

@@ -30,7 +30,7 @@ from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.types import PointCloud
 
-CONFIG = PreparationConfig()
+CONFIG = PreparationConfig(viewpoint="centroid")  # a guess costs time and is tested by itself
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -165,7 +165,7 @@ def test_too_few_points_are_refused_with_the_numbers() -> None:
 
 def test_a_cloud_of_too_many_voxels_keeps_a_seeded_choice() -> None:
     cloud = PointCloud(corner(np.random.default_rng(4), 20_000))
-    config = PreparationConfig(max_points=500)
+    config = PreparationConfig(max_points=500, viewpoint="centroid")
     everything = prepare(cloud, 0.1, CONFIG)
     made = [prepare(cloud, 0.1, config, seed=seed) for seed in (0, 0, 1)]
     assert len(everything) > 500 >= len(made[0]) > 100
@@ -173,6 +173,17 @@ def test_a_cloud_of_too_many_voxels_keeps_a_seeded_choice() -> None:
     np.testing.assert_array_equal(made[0].points, made[1].points)
     np.testing.assert_array_equal(made[0].normals, made[1].normals)
     assert {tuple(p) for p in made[0].points} != {tuple(p) for p in made[2].points}
+
+
+def test_too_many_voxels_spoil_neither_normals_nor_counts() -> None:
+    """A dense flat scan stays well described when only some of its voxel points are kept."""
+    cloud = PointCloud(corner(np.random.default_rng(4), 60_000, noise=0.002))
+    config = PreparationConfig(max_points=300, viewpoint="centroid")
+    made = prepare(cloud, 0.05, config)
+    assert made.num_isolated == 0
+    assert len(made) == pytest.approx(300, abs=15)
+    inner = (made.points > 0.3).sum(1) == 2
+    assert np.abs(made.normals[inner]).max(1).min() > np.cos(np.radians(10))
 
 
 @pytest.mark.parametrize(
@@ -209,7 +220,7 @@ def test_normals_of_planes_are_exact_and_face_the_sensor() -> None:
 
 
 def test_normals_face_the_centroid_where_that_is_asked_for() -> None:
-    made = prepare(PointCloud(corner(np.random.default_rng(6))), 0.1, PreparationConfig(viewpoint="centroid"))
+    made = prepare(PointCloud(corner(np.random.default_rng(6))), 0.1, CONFIG)
     assert made.viewpoint is None
     assert (np.einsum("ij,ij->i", made.normals, made.points.mean(0) - made.points) >= 0).all()
 
@@ -217,7 +228,7 @@ def test_normals_face_the_centroid_where_that_is_asked_for() -> None:
 def test_without_a_viewpoint_normals_face_the_side_from_which_a_corner_can_be_seen() -> None:
     """The three faces hide nothing from each other on the inner side only where all face the same place."""
     for seed in range(3):
-        made = prepare(PointCloud(corner(np.random.default_rng(seed))), 0.1, CONFIG)
+        made = prepare(PointCloud(corner(np.random.default_rng(seed))), 0.1, PreparationConfig())
         assert made.viewpoint is None  # a guess is no knowledge: free space is not judged from it
         inner = (made.points > 0.4).sum(1) == 2
         assert (made.normals[inner].sum(1) > 0).mean() > 0.95

@@ -11,9 +11,11 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+import geomoe3d
 from geomoe3d.answer import Findings
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import JudgementConfig, PreparationConfig, RefinementConfig
+from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.geometry.se3 import (
     inverse,
     make_transform,
@@ -56,7 +58,7 @@ def surfaces(kind: str, seed: int = 0, count: int = 12_000) -> np.ndarray:
 
 
 def prepared(points: np.ndarray, voxel: float = VOXEL) -> PreparedCloud:
-    return prepare(PointCloud(points), voxel, PreparationConfig())
+    return prepare(PointCloud(points), voxel, PreparationConfig(viewpoint="centroid"))
 
 
 def motion(seed: int) -> np.ndarray:
@@ -338,6 +340,20 @@ def test_lead_over_the_other() -> None:
     assert lead_over(evidence(0.0), None) == 1
     # An answer without a rival has beaten none: more than a tie, less than a clear victory.
     assert 1 < lead_over(evidence(0.6), None) < 10
+
+
+def test_a_scene_that_stands_twice_in_the_target_is_ambiguous() -> None:
+    """Both places are right; an answer that calls one of them sure has not looked for the other."""
+    source, target, T = make_sample_pair(0)
+    twice = np.vstack([target.file_points, target.file_points + [12.0, 0, 0]])
+    answer = geomoe3d.register(source.file_points, twice, voxel_size=0.07)
+    places = [T, perturbation(np.zeros(3), np.array([12.0, 0, 0]), np.zeros(3)) @ T]
+    assert min(translation_error(answer.T_target_source, place) for place in places) < 0.2
+    assert answer.status == "ambiguous"
+    other = answer.alternative
+    assert other is not None
+    assert min(translation_error(other.T_target_source, place) for place in places) < 0.3
+    assert other.translation_difference == pytest.approx(12, abs=0.4)
 
 
 # ---- findings and the clock ------------------------------------------------------------------------------

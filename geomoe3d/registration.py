@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,6 +53,14 @@ class Explanation:
     def weights(self) -> FloatArray:
         """(K,) the filter's weights."""
         return self.weighed.weights
+
+
+class Refined(NamedTuple):
+    """A motion (4, 4) in local coordinates, what the clouds say of it, and what went wrong, if anything."""
+
+    T_target_source: FloatArray
+    evidence: Evidence
+    note: str | None
 
 
 class Registrar:
@@ -135,7 +143,9 @@ class Registrar:
         verifier = Verifier(*described, threshold, seed=seed)
         ranked = verifier.rank(hypotheses)
         clock("refine")
-        findings = self.settle(hypotheses, ranked, verifier, described, threshold)
+        answer = self.refine(self.choose(hypotheses, ranked), verifier, described)
+        clock("judge")
+        findings = self.judge(answer, ranked, described, threshold)
         result = finished_result(described, matched, findings, config, threshold, clock.stop())
         inliers = findings.residuals(matched) < threshold
         return Explanation(result, *clouds, matched, weighed, inliers)
@@ -168,31 +178,49 @@ class Registrar:
             )
         return found
 
-    def settle(
+    def choose(
+        self, hypotheses: list[Hypothesis], ranked: list[tuple[Hypothesis, Evidence]]
+    ) -> FloatArray | None:
+        """The motion that the clouds, or without verification the correspondences, like best."""
+        if not ranked:
+            return None
+        best = ranked[0][0] if self.config.verification.enabled else hypotheses[0]
+        return best.T_target_source
+
+    def refine(
         self,
-        hypotheses: list[Hypothesis],
-        ranked: list[tuple[Hypothesis, Evidence]],
+        T_target_source: FloatArray | None,
         verifier: Verifier,
+        described: tuple[PreparedCloud, PreparedCloud],
+    ) -> Refined | None:
+        """The motion refined on the clouds, or as it was where that made them fit less well."""
+        if T_target_source is None:
+            return None
+        T, note = refine(T_target_source, *described, self.config.refinement)
+        before, after = verifier.evidence(T_target_source), verifier.evidence(T)
+        if after.score < _KEPT_EVIDENCE * before.score:
+            note = "refinement made the clouds fit less well; the unrefined motion is given"
+            return Refined(T_target_source, before, note)
+        return Refined(T, after, note)
+
+    def judge(
+        self,
+        answer: Refined | None,
+        ranked: list[tuple[Hypothesis, Evidence]],
         described: tuple[PreparedCloud, PreparedCloud],
         threshold: float,
     ) -> Findings:
-        """Choose the best hypothesis, refine it and judge it against the best other one."""
-        if not ranked:
+        """What to say of the answer, beside the best clearly different motion."""
+        if answer is None:
             return Findings.nothing("no motion brings three correspondences in general position together")
-        source, target = described
-        start = (ranked if self.config.verification.enabled else verifier.rank(hypotheses[:1]))[0][0]
-        T, note = refine(start.T_target_source, source, target, self.config.refinement)
-        evidence, unrefined = verifier.evidence(T), verifier.evidence(start.T_target_source)
-        if evidence.score < _KEPT_EVIDENCE * unrefined.score:
-            T, evidence = start.T_target_source, unrefined
-            note = "refinement made the clouds fit less well; the unrefined motion is given"
-        other = clearly_different(ranked, T, source, 3 * threshold)
-        lead = lead_over(evidence, other[1] if other else None)
-        information = measure_information(T, source, target, threshold)
-        judgement = judge(evidence, lead, information, self.config.judgement)
-        if note is not None:
-            judgement = replace(judgement, reasons=(*judgement.reasons, note))
-        return Findings(T, other[0] if other else None, lead, evidence, information, judgement)
+        T = answer.T_target_source
+        other = clearly_different(ranked, T, described[0], 3 * threshold)
+        lead = lead_over(answer.evidence, other[1] if other else None)
+        information = measure_information(T, *described, threshold)
+        judgement = judge(answer.evidence, lead, information, self.config.judgement)
+        if answer.note is not None:
+            judgement = replace(judgement, reasons=(*judgement.reasons, answer.note))
+        return Findings(T, other[0] if other else None, lead, answer.evidence, information, judgement)
 
 
 def register(

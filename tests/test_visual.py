@@ -66,6 +66,7 @@ def make_result(T: np.ndarray, **changes) -> RegistrationResult:
         "reasons": (),
         "confidence": 0.9,
         "overlap": 0.6,
+        "evidence": {},
         "num_correspondences": 300,
         "num_inliers": 200,
         "inlier_threshold": 0.1,

@@ -343,17 +343,21 @@ def test_lead_over_the_other() -> None:
 
 
 def test_a_scene_that_stands_twice_in_the_target_is_ambiguous() -> None:
-    """Both places are right; an answer that calls one of them sure has not looked for the other."""
+    """A room with two halves alike, seen from its middle: both places are right, and the answer knows it."""
     source, target, T = make_sample_pair(0)
-    twice = np.vstack([target.file_points, target.file_points + [12.0, 0, 0]])
+    half_turn = np.diag([-1.0, 1, -1, 1])
+    twice = np.vstack([target.file_points, transform_points(half_turn, target.file_points)])
     answer = geomoe3d.register(source.file_points, twice, voxel_size=0.07)
-    places = [T, perturbation(np.zeros(3), np.array([12.0, 0, 0]), np.zeros(3)) @ T]
-    assert min(translation_error(answer.T_target_source, place) for place in places) < 0.2
+    places = [T, half_turn @ T]
+    errors = [rotation_error_deg(answer.T_target_source, place) for place in places]
+    assert min(errors) < 1
     assert answer.status == "ambiguous"
+    assert answer.confidence <= 0.5
     other = answer.alternative
     assert other is not None
-    assert min(translation_error(other.T_target_source, place) for place in places) < 0.3
-    assert other.translation_difference == pytest.approx(12, abs=0.4)
+    assert rotation_error_deg(other.T_target_source, places[1 - int(np.argmin(errors))]) < 5
+    assert other.rotation_difference_deg > 175
+    assert other.relative_score > 0.8
 
 
 # ---- findings and the clock ------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -40,6 +40,10 @@ class Findings:
         """No hypothesis at all."""
         nothing = Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, 0)
         return cls(np.full((4, 4), np.nan), None, np.inf, None, nothing, Judgement("failed", (reason,), 0.0))
+
+    def with_note(self, note: str) -> Findings:
+        """The same findings with one more sentence among the reasons."""
+        return replace(self, judgement=replace(self.judgement, reasons=(*self.judgement.reasons, note)))
 
     def residuals(self, matched: Correspondences) -> FloatArray:
         """|R p + t - q| of every correspondence (N,); infinite without a transform."""

@@ -29,7 +29,7 @@ class PreparationConfig(Section):
 
     voxel_points: int = Field(5000, ge=200, description="points per cloud that an automatic voxel aims at")
     max_points: int = Field(
-        30_000, ge=100, description="voxel points kept per cloud; beyond it a seeded choice is taken"
+        30_000, ge=100, description="most voxel points per cloud; a finer voxel size is raised and said"
     )
     normal_radius: float = Field(2.0, gt=0, description="neighbourhood of a normal, in voxels")
     normal_neighbors: int = Field(30, ge=3, description="at most so many points fit a normal")
@@ -75,7 +75,7 @@ class EstimatorConfig(Section):
         "fit, for correspondences that are nearly all right",
     )
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
-    num_hypotheses: int = Field(15, ge=1, description="distinct hypotheses kept by each round")
+    num_hypotheses: int = Field(15, ge=1, description="distinct hypotheses that consensus keeps by round")
     one_way_weight: float = Field(
         0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"
     )

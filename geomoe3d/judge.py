@@ -122,8 +122,8 @@ def judge(
         and confidence_score(evidence.score, np.inf) >= config.min_confidence
     ):
         notes.append(
-            f"a clearly different motion fits {100 / lead:.0f} % as well; see the alternative, the scans may "
-            "show repeated or symmetric structure"
+            f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "
+            "the scans may show repeated or symmetric structure"
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.5))
     if confidence < config.min_confidence:

@@ -14,7 +14,13 @@ from geomoe3d.answer import Findings, failed_result, finished_result
 from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.matching import match
-from geomoe3d.clouds.prepare import check_cloud, choose_voxel_size, prepare, scale_mismatch
+from geomoe3d.clouds.prepare import (
+    bounded_voxel_size,
+    check_cloud,
+    choose_voxel_size,
+    prepare,
+    scale_mismatch,
+)
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
@@ -27,6 +33,7 @@ from geomoe3d.stages import Progress, StageClock
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 from geomoe3d.verification import Evidence, Verifier, clearly_different
 
+_CLOSE_LEAD = 2.0
 _KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
 
 
@@ -128,7 +135,8 @@ class Registrar:
         if mismatch is not None:
             return Explanation(failed_result(clouds, mismatch, config, clock.stop()), *clouds)
         clock("prepare")
-        voxel_size = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
+        wanted = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
+        voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         threshold = config.estimator.inlier_threshold * voxel_size
         prepared = self.prepare(*clouds, voxel_size)
         clock("describe")
@@ -145,7 +153,12 @@ class Registrar:
         clock("refine")
         answer = self.refine(self.choose(hypotheses, ranked), verifier, described)
         clock("judge")
-        findings = self.judge(answer, ranked, described, threshold)
+        findings = self.judge(answer, ranked, verifier, described, threshold)
+        if voxel_size > wanted:
+            findings = findings.with_note(
+                f"a voxel size of {wanted:.4g} gives more than {config.preparation.max_points} voxels; "
+                f"{voxel_size:.4g} was used (preparation.max_points sets the limit)"
+            )
         result = finished_result(described, matched, findings, config, threshold, clock.stop())
         inliers = findings.residuals(matched) < threshold
         return Explanation(result, *clouds, matched, weighed, inliers)
@@ -207,6 +220,7 @@ class Registrar:
         self,
         answer: Refined | None,
         ranked: list[tuple[Hypothesis, Evidence]],
+        verifier: Verifier,
         described: tuple[PreparedCloud, PreparedCloud],
         threshold: float,
     ) -> Findings:
@@ -216,11 +230,16 @@ class Registrar:
         T = answer.T_target_source
         other = clearly_different(ranked, T, described[0], 3 * threshold)
         lead = lead_over(answer.evidence, other[1] if other else None)
+        if other is not None and lead < _CLOSE_LEAD:  # a fair race: the rival is refined too
+            rival = self.refine(other[0].T_target_source, verifier, described)
+            if rival is not None and rival.evidence.score > other[1].score:
+                moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
+                other = clearly_different([moved], T, described[0], 3 * threshold) or other
+                lead = lead_over(answer.evidence, other[1])
         information = measure_information(T, *described, threshold)
         judgement = judge(answer.evidence, lead, information, self.config.judgement)
-        if answer.note is not None:
-            judgement = replace(judgement, reasons=(*judgement.reasons, answer.note))
-        return Findings(T, other[0] if other else None, lead, answer.evidence, information, judgement)
+        findings = Findings(T, other[0] if other else None, lead, answer.evidence, information, judgement)
+        return findings if answer.note is None else findings.with_note(answer.note)
 
 
 def register(

@@ -14,7 +14,7 @@ from geomoe3d.types import FloatArray
 
 Status = Literal["ok", "low_confidence", "ambiguous", "failed"]
 
-_ARRAYS = ("T_target_source", "information_matrix", "information_center")
+_ARRAYS = {"T_target_source": (4, 4), "information_matrix": (6, 6), "information_center": (3,)}
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,8 @@ class RegistrationResult:
         status: ok | low_confidence | ambiguous | failed.
         reasons: why the status is not ok, or what deserves attention; sentences.
         confidence: in [0, 1]; see docs/concepts.md for what it is made of.
-        overlap: share of source voxel points with a target surface point within the inlier threshold.
+        overlap: share of source voxel points (1,500 of them at most) with a target point within the inlier
+            threshold.
         evidence: what the clouds say of the answer, see `geomoe3d.verification.Evidence`; empty where
             nothing was estimated.
         num_correspondences: correspondences given to the estimator.
@@ -78,8 +79,8 @@ class RegistrationResult:
         alternative: the best clearly different motion, or None.
         information_matrix: (6, 6), order [rotation (rad), translation], for the left perturbation
             p_target -> exp(rotation) (p_target - c) + c + translation in the target file's axes, with
-            c = ``information_center``; in units of 1/cloud unit^2 scaled by the refinement's residual
-            variance. NaN where nothing was estimated.
+            c = ``information_center``; over the point-to-plane residual variance of the matched points.
+            NaN where nothing was estimated.
         information_center: (3,) the point c, target file coordinates.
         source, target: what became of each cloud.
         seconds: wall time of each stage and ``total``.
@@ -134,8 +135,8 @@ class RegistrationResult:
         """The same answer with the roles of source and target exchanged.
 
         The information matrix is carried over to the new target (the old source): the perturbation is
-        expressed in its axes about the same physical point. Overlap keeps the meaning measured on the
-        original source.
+        expressed in its axes about the same physical point. Overlap, evidence and the alternative's
+        translation difference keep the meaning measured on the original source.
         """
         from geomoe3d.geometry.se3 import inverse, transform_points
 
@@ -171,17 +172,21 @@ class RegistrationResult:
         """
         try:
             data = json.loads(text)
-            for name in _ARRAYS:
-                data[name] = _array(data[name])
+            for name, shape in _ARRAYS.items():
+                data[name] = _array(data[name], shape)
+            for name in ("inlier_threshold", "voxel_size"):
+                data[name] = float("nan") if data[name] is None else float(data[name])
             if data["alternative"] is not None:
-                data["alternative"]["T_target_source"] = _array(data["alternative"]["T_target_source"])
+                data["alternative"]["T_target_source"] = _array(
+                    data["alternative"]["T_target_source"], (4, 4)
+                )
                 data["alternative"] = Alternative(**data["alternative"])
             for side in ("source", "target"):
                 data[side]["origin"] = tuple(data[side]["origin"])
                 data[side] = CloudReport(**data[side])
             data["reasons"] = tuple(data["reasons"])
             return cls(**data)
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"this text is not a registration result: {error!r}") from None
 
 
@@ -200,5 +205,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _array(value: Any) -> FloatArray:
-    return np.array(value, dtype=np.float64)  # None becomes NaN
+def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
+    array = np.array(value, dtype=np.float64)  # None becomes NaN
+    if array.shape != shape:
+        raise ValueError(f"an array of shape {array.shape} where {shape} is expected")
+    return array

@@ -36,7 +36,7 @@ class Evidence:
         distinctiveness: mean over source points of (-ln p - 1) x (1 - (d / threshold)^2) for agreeing
             points and 0 for the others; about zero for chance overlap, larger is better.
         free_space_violation: share of source points in target's free space over those it could see, plus
-            the same with the roles exchanged; 0 where the viewpoints are not known.
+            the same with the roles exchanged; 0 where a viewpoint is neither known nor guessed.
         score: distinctiveness x exp(-10 free_space_violation), not below zero.
     """
 
@@ -105,7 +105,7 @@ class Verifier:
         nearest = nearest[hit]
         normals = self._normals[hit] @ T_target_source[:3, :3].T
         cosine = np.einsum("ij,ij->i", normals, self._target.normals[nearest])
-        # Without sensor positions the normals' signs are a guess, and only their lines can be compared.
+        # Without both sensor positions the normals' signs are a guess, and only their lines can be compared.
         agrees = (cosine if self._target_view is not None else np.abs(cosine)) > _LEAST_COSINE
         similarity = np.einsum("ij,ij->i", self._features[hit], self._target_features[nearest])
         more_similar = (self._random_similarity[hit] > similarity[:, None]).sum(1)

@@ -94,4 +94,5 @@ def nearest_features(
     ratio = np.where(usable, distance / np.where(usable, next_distance, 1), 1)
     # Comparing values instead of indices saves the slow search along the columns.
     mutual: BoolArray = best >= column_best[index]
+    mutual[:, 1:] = False  # only the first choice can be each other's nearest
     return index, distance, np.minimum(ratio, 1).astype(np.float32), mutual

@@ -33,10 +33,10 @@ def prepare(
     Args:
         cloud: finite points in local coordinates.
         voxel_size: edge of the grid, cloud units.
-        config: neighbourhoods in voxels and the limit on points.
+        config: neighbourhoods in voxels.
         viewpoint: (3,) local position of the sensor; None guesses it. Where no guess is plausible, or none
             is wanted (``config.viewpoint`` centroid), normals turn to the cloud's centroid.
-        seed: decides which voxels stay when there are more than ``config.max_points``.
+        seed: decides the guess.
 
     Returns:
         A cloud without features; see `PreparedCloud` for what was dropped and counted.
@@ -47,9 +47,6 @@ def prepare(
     """
     points, num_duplicates = drop_duplicates(cloud.points)
     voxels = voxel_means(points, voxel_size)
-    if len(voxels) > config.max_points:
-        rng = np.random.default_rng(seed)
-        voxels = voxels[np.sort(rng.choice(len(voxels), config.max_points, replace=False))]
     num_voxels = len(voxels)
     radius = config.normal_radius * voxel_size
     voxels = drop_isolated(voxels, radius)
@@ -108,12 +105,33 @@ def check_cloud(cloud: PointCloud) -> None:
         )
 
 
+def robust_extent(points: FloatArray) -> float:
+    """Diagonal of the box that holds the central 98 % along each axis: stray points do not count."""
+    sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
+    low, high = np.percentile(sample, [1, 99], axis=0)
+    extent = float(np.linalg.norm(high - low))
+    return extent if extent > 0 else float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float, max_points: int) -> float:
+    """The given size, or the next larger at which neither cloud occupies more than ``max_points`` voxels.
+
+    Raises:
+        InputError: a voxel so small that the grid's indices overflow.
+    """
+    for cloud in (source, target):
+        while (occupied := len(np.unique(voxel_keys(cloud.points, voxel_size)))) > max_points:
+            # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
+            voxel_size *= 1.02 * float(np.sqrt(occupied / max_points))
+    return voxel_size
+
+
 def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
     """A sentence where two extents differ so much that the units must differ, else None.
 
     A factor of 50 is far beyond partial overlap of two scans, and far below millimetres against metres.
     """
-    extents = [float(np.linalg.norm(np.ptp(cloud.points, axis=0))) for cloud in (source, target)]
+    extents = [robust_extent(cloud.points) for cloud in (source, target)]
     small, large = sorted(extents)
     if small <= 0 or large / small < _MAX_EXTENT_RATIO:
         return None
@@ -130,7 +148,7 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     Surfaces fill voxels like 1 / size^2, which gives the next guess; three are enough for two digits.
     """
     sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
-    extent = float(np.ptp(points, axis=0).max())
+    extent = robust_extent(points)
     # A small cloud cannot fill the voxels asked for; half its points is what a grid can still even out.
     goal = min(num_points, max(len(sample) // 2, 1))
     size = extent / np.sqrt(goal)
@@ -143,7 +161,7 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
 def typical_spacing(points: FloatArray) -> float:
     """Median distance from a point to its nearest other, cloud units; 0 where most points coincide.
 
-    Estimated on at most 2,000 points inside the central part of the cloud that holds about 20,000.
+    Estimated on about 2,000 points inside the central part of the cloud that holds about 20,000.
     """
     from scipy.spatial import cKDTree
 
@@ -207,11 +225,13 @@ def drop_isolated(points: FloatArray, radius: float) -> FloatArray:
     """Points that have at least two others within ``radius``: fewer fix no plane."""
     from scipy.spatial import cKDTree
 
-    if len(points) < 3:
-        return points[:0]
-    distances, _ = cKDTree(points).query(points, k=3)
-    kept: FloatArray = points[np.asarray(distances)[:, 2] <= radius]
-    return kept
+    while len(points) >= 3:
+        distances, _ = cKDTree(points).query(points, k=3)
+        close = np.asarray(distances)[:, 2] <= radius
+        if close.all():
+            return points
+        points = points[close]  # whoever leaned on the dropped ones may now be isolated too
+    return points[:0]
 
 
 def estimate_normals(points: FloatArray, radius: float, neighbors: int) -> FloatArray:

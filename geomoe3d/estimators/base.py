@@ -26,8 +26,8 @@ class Estimator(Protocol):
         """Estimate rigid motions p_target = R p_source + t.
 
         Args:
-            correspondences: (N, 6) rows [source xyz, target xyz], one unit of length, near the origin
-                (within about 1e4 extents: distances are formed in float32).
+            correspondences: (N, 6) rows [source xyz, target xyz], one unit of length; extents up to
+                about 1e5 inlier thresholds (distances are formed in float32).
             weights: (N,) non-negative, or None for all ones.
             inlier_threshold: largest residual of an inlier, same unit.
             seed: decides every random choice.

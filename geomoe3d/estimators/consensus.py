@@ -70,7 +70,8 @@ class ConsensusEstimator:
         # One unit of length is the inlier threshold from here on, so float32 keeps enough digits.
         unit = ((rows - centre) / inlier_threshold).astype(np.float32)
         source, target = np.ascontiguousarray(unit[:, :3]), np.ascontiguousarray(unit[:, 3:])
-        vote = (given / given.max()).astype(np.float32) * bundle_weights(rows[:, 3:])
+        # Multiples of 1/1024 add up exactly in float32, in whatever order the threads do it.
+        vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
         R, t = self._propose(source, target, vote, self._dense_rows(given, seed))
         R, t = self._keep_distinct(R, t, score(R, t, source, target, vote), self.num_refined)
         for _ in range(self.num_refits):
@@ -108,22 +109,19 @@ class ConsensusEstimator:
         return R[keep], t[keep]
 
     def _distinct_rows(self, R: Floats, t: Floats, scores: Floats, limit: int) -> list[int]:
-        """Greedy choice by score, leaving out motions close to one already taken.
-
-        Only the best 10 x ``limit`` are looked at: the rest has no chance and costs time.
-        """
+        """Greedy choice by score; each pick takes all motions close to it out of the race."""
         least_trace = 1 + 2 * np.cos(np.radians(self.distinct_angle_deg))
         keep: list[int] = []
-        for k in np.argsort(-scores, kind="stable")[: 10 * limit]:
-            if keep:
-                trace = np.einsum("kij,ij->k", R[keep], R[k])
-                # The centroid is at zero in these coordinates, so t is where it goes.
-                distance = np.linalg.norm(t[keep] - t[k], axis=1)
-                if ((trace > least_trace) & (distance < self.distinct_thresholds)).any():
-                    continue
-            keep.append(int(k))
-            if len(keep) == limit:
-                break
+        left = np.argsort(-scores, kind="stable")
+        while len(left) and len(keep) < limit:
+            pick = int(left[0])
+            keep.append(pick)
+            trace = np.einsum("kij,ij->k", R[left], R[pick])
+            # The centroid is at zero in these coordinates, so t is where it goes.
+            distance = np.linalg.norm(t[left] - t[pick], axis=1)
+            same = (trace > least_trace) & (distance < self.distinct_thresholds)
+            same[0] = True
+            left = left[~same]
         return keep
 
     def _finish(
@@ -233,7 +231,7 @@ def score(R: Floats, t: Floats, source: Float32Array, target: Float32Array, vote
         part = slice(start, start + step)
         kernel = squared_residuals(R[part], t[part], source, target)
         kernel *= -0.5 / 0.75**2
-        scores[part] = np.exp(kernel, out=kernel) @ vote
+        scores[part] = np.einsum("kn,n->k", np.exp(kernel, out=kernel), vote)
     return scores
 
 

@@ -68,7 +68,9 @@ class RansacEstimator:
         T = np.array(answer.transformation, dtype=np.float64)
         r2 = squared_residuals(T[None, :3, :3], T[None, :3, 3], rows[:, :3], rows[:, 3:])[0]
         num_inliers = int((r2 < inlier_threshold**2).sum())
-        if len(answer.correspondence_set) < 3 or num_inliers < 3:
+        # Inliers on a line leave the turn about it free: that is no answer either.
+        thinnest = min(spread(half, (r2 < inlier_threshold**2) * 1.0) for half in (rows[:, :3], rows[:, 3:]))
+        if len(answer.correspondence_set) < 3 or num_inliers < 3 or thinnest < 0.05 * inlier_threshold:
             return []
         score = float(np.maximum(1 - r2 / inlier_threshold**2, 0).sum())
         return [Hypothesis(T, score, num_inliers)]

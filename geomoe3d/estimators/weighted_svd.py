@@ -17,6 +17,8 @@ from geomoe3d.types import Hypothesis
 class WeightedSvdEstimator:
     """Weighted Kabsch over all correspondences, then reweighted re-fits on the inliers.
 
+    This is the numpy form; `geomoe3d.geometry.kabsch.weighted_kabsch` is the batched differentiable twin.
+
     Attributes:
         num_refits: rounds of re-fitting with weights w / (1 + (r / threshold)^2) on residuals under the
             threshold; 0 gives the plain weighted SVD. Source: PointDSC's post-refinement uses 20.
@@ -45,6 +47,6 @@ class WeightedSvdEstimator:
                 break
             R, t = fit_rigid(source, target, inner)
         r2 = squared_residuals(R[None], t[None], source, target)[0]
-        score = float(w @ np.maximum(1 - r2 / inlier_threshold**2, 0))
+        score = float((w * np.maximum(1 - r2 / inlier_threshold**2, 0)).sum())
         num_inliers = int((r2 < inlier_threshold**2).sum())
         return [Hypothesis(make_transform(R, t), score, num_inliers)]

@@ -33,14 +33,14 @@ def fit_rigid(source: Floats, target: Floats, weights: Floats) -> tuple[Floats, 
     w = weights / np.maximum(weights.sum(-1, keepdims=True), np.finfo(weights.dtype).tiny)
     source_mean = np.einsum("...n,...nd->...d", w, source)
     target_mean = np.einsum("...n,...nd->...d", w, target)
-    H = np.swapaxes((source - source_mean[..., None, :]) * w[..., None], -1, -2) @ (
-        target - target_mean[..., None, :]
-    )
+    weighted = (source - source_mean[..., None, :]) * w[..., None]
+    # einsum sums in one order for any number of threads; a matrix product does not.
+    H = np.einsum("...ni,...nj->...ij", weighted, target - target_mean[..., None, :])
     return _motion(H, source_mean, target_mean)
 
 
 def fit_rigid_shared(source: Floats, target: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """`fit_rigid` for K weightings of the same N points, through moments and one matrix product.
+    """`fit_rigid` for K weightings of the same N points, through their moments.
 
     Args:
         source: (N, 3) points, near their centroid (moments cancel badly far from it).
@@ -51,10 +51,11 @@ def fit_rigid_shared(source: Floats, target: Floats, weights: Floats) -> tuple[F
         R (K, 3, 3), t (K, 3) as in `fit_rigid`.
     """
     total = np.maximum(weights.sum(1), np.finfo(weights.dtype).tiny)[:, None]
-    source_mean = weights @ source / total
-    target_mean = weights @ target / total
     products = (source[:, :, None] * target[:, None, :]).reshape(len(source), 9)
-    H = (weights @ products / total).reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
+    # einsum sums in one order for any number of threads; a matrix product does not.
+    moments = np.einsum("kn,nd->kd", weights, np.hstack([source, target, products])) / total
+    source_mean, target_mean = moments[:, :3], moments[:, 3:6]
+    H = moments[:, 6:].reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
     return _motion(H, source_mean, target_mean)
 
 
@@ -87,7 +88,7 @@ def spread(points: Floats, weights: Floats) -> float:
     total = weights.sum()
     if total <= 0:
         return 0.0
-    mean = weights @ points / total
+    mean = np.einsum("n,nd->d", weights, points) / total
     centred = (points - mean).astype(np.float64)
-    covariance = (centred * weights[:, None]).T @ centred / total
+    covariance = np.einsum("ni,nj->ij", centred * weights[:, None], centred) / total
     return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)))

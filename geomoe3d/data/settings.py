@@ -27,13 +27,13 @@ class SynthesisSettings(Section):
         12, ge=2, description="depth frames fused into one; stand for 50 recorded ones"
     )
     clutter: tuple[float, float] = Field(
-        (4.0, 60.0), description="range of small things per square metre of table or shelf, log-uniform"
+        (5.0, 60.0), description="range of small things per square metre of table or shelf, log-uniform"
     )
     shares: SceneShares = SceneShares()
     fusion_voxel: float = Field(0.012, gt=0, description="edge of the fusion grid, metres")
     grid: float = Field(0.025, gt=0, description="one point is kept per cell of this edge, metres")
-    drift_metres: float = Field(0.006, ge=0, description="error of the tracked position after a fragment")
-    drift_deg: float = Field(0.2, ge=0, description="error of each tracked angle after a fragment")
+    drift_metres: float = Field(0.008, ge=0, description="error of the tracked position after a fragment")
+    drift_deg: float = Field(0.25, ge=0, description="error of each tracked angle after a fragment")
     min_points: int = Field(3000, ge=100, description="fragments with fewer points are recorded elsewhere")
     min_overlap: float = Field(0.1, ge=0, le=1, description="least overlap of a pair in gt.log")
     sensor: SensorSettings = SensorSettings()

@@ -120,7 +120,7 @@ def furnish(
             for _ in range(int(rng.integers(least, most + 1))):
                 decorator.put(name)
     low, high = np.array(room.rect[:2]), np.array(room.rect[2:])
-    litter(solids, rng, low, high, int(rng.poisson(0.25 * area)))
+    litter(solids, rng, low, high, int(rng.poisson(0.4 * area)))
     return kind
 
 

@@ -43,7 +43,7 @@ class Scene:
 
 
 def generate_scene(
-    rng: np.random.Generator, library: ModelLibrary | None = None, density: tuple[float, float] = (4.0, 60.0)
+    rng: np.random.Generator, library: ModelLibrary | None = None, density: tuple[float, float] = (5.0, 60.0)
 ) -> Scene:
     """A furnished room or flat.
 

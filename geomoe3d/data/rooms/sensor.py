@@ -79,12 +79,12 @@ class SensorSettings(Section):
     far: float = 4.5
     baseline: float = 0.075
     disparity_step: float = 0.125
-    disparity_noise: float = 0.145
+    disparity_noise: float = 0.14
     edge_shift: float = 0.8
     min_slope: float = 0.08
     full_slope: float = 0.25
     hole_share: float = 0.03
-    bias: float = 0.006
+    bias: float = 0.008
 
 
 def cast(scene: Any, camera: Camera, T_world_camera: FloatArray) -> Hits:

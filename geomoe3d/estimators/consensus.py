@@ -45,7 +45,7 @@ class ConsensusEstimator:
     """
 
     num_hypotheses: int = 8
-    num_seeds: int = 500
+    num_seeds: int = 300
     set_size: int = 10
     num_refined: int = 20
     num_refits: int = 6
@@ -159,11 +159,11 @@ def bundle_weights(target: FloatArray) -> Float32Array:
 
 def pairwise_distances(points: Float32Array) -> Float32Array:
     """(N, N) Euclidean distances of centred points (N, 3) through one matrix product."""
-    squares = (points * points).sum(1)
-    distances = points @ points.T
-    distances *= -2
-    distances += squares[:, None]
-    distances += squares[None]
+    squares = (points * points).sum(1, keepdims=True)
+    ones = np.ones_like(squares)
+    # [-2p, |p|^2, 1] . [q, 1, |q|^2] = |p - q|^2 without a further pass over N x N numbers.
+    left, right = np.hstack([-2 * points, squares, ones]), np.hstack([points, ones, squares])
+    distances = left @ right.T
     np.maximum(distances, 0, out=distances)
     np.sqrt(distances, out=distances)
     return distances

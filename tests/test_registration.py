@@ -212,6 +212,22 @@ def test_voxel_size_is_used_reported_and_bounded(pair):
         geomoe3d.register(*pair[:2], voxl_size=0.05)
 
 
+def test_a_voxel_size_too_fine_for_the_limit_is_raised_and_said(pair):
+    config = load_config(None, ["voxel_size=0.01", "preparation.max_points=6000"])
+    result = Registrar(config).register(*pair[:2])
+    assert result.status == "ok"
+    assert 0.01 < result.voxel_size < 0.1
+    assert max(result.source.num_points, result.target.num_points) <= 6000
+    assert any("0.01 gives more than 6000 voxels" in reason for reason in result.reasons)
+
+
+def test_stray_points_far_away_do_not_matter(pair):
+    stray = np.vstack([pair[0], [[1e4, 0.0, 0.0]]])
+    result = geomoe3d.register(stray, pair[1])
+    assert result.status == "ok"
+    assert images_apart(result.T_target_source, pair[2], pair[0]) < 0.03
+
+
 @pytest.mark.parametrize(
     "assignment",
     ["estimator.name=ransac", "filter.name=spectral", "refinement.method=icp", "matching.method=mutual"],

@@ -93,6 +93,7 @@ def test_unreadable_file(tmp_path: Path, suffix: str, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(io, "open", refuse)
     monkeypatch.setattr(builtins, "open", refuse)
+    monkeypatch.setattr(Path, "open", refuse)  # Python 3.10 bound io.open when pathlib was imported
     fails(path, "permission denied", error=InputError)
 
 

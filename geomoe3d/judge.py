@@ -98,8 +98,8 @@ def judge(
         config: thresholds.
 
     Returns:
-        ``ambiguous`` where another motion is about as good or the surfaces let the source slide,
-        ``low_confidence`` below the threshold, else ``ok``.
+        ``ambiguous`` where the surfaces let the source slide, or where the evidence would do but another
+        motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
     confidence = confidence_score(evidence.score, lead)
     notes = []
@@ -119,7 +119,7 @@ def judge(
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     if (
         lead < 1 / config.ambiguity_ratio
-        and confidence_score(evidence.score, np.inf) >= config.min_confidence
+        and confidence_score(evidence.score, _UNRIVALLED_LEAD) >= config.min_confidence
     ):
         notes.append(
             f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "

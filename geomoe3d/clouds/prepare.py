@@ -151,7 +151,7 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     extent = robust_extent(points)
     # A small cloud cannot fill the voxels asked for; half its points is what a grid can still even out.
     goal = min(num_points, max(len(sample) // 2, 1))
-    size = extent / np.sqrt(goal)
+    size = extent / float(np.sqrt(goal))
     for _ in range(4):
         occupied = len(np.unique(voxel_keys(sample, size)))
         size = min(size * float(np.sqrt(occupied / goal)), extent)

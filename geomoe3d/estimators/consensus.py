@@ -163,7 +163,7 @@ def pairwise_distances(points: Float32Array) -> Float32Array:
     ones = np.ones_like(squares)
     # [-2p, |p|^2, 1] . [q, 1, |q|^2] = |p - q|^2 without a further pass over N x N numbers.
     left, right = np.hstack([-2 * points, squares, ones]), np.hstack([points, ones, squares])
-    distances = left @ right.T
+    distances: Float32Array = left @ right.T
     np.maximum(distances, 0, out=distances)
     np.sqrt(distances, out=distances)
     return distances

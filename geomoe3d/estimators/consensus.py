@@ -182,15 +182,20 @@ def compatibility(source_distance: Float32Array, target_distance: Float32Array) 
 
 
 def choose_seeds(support: Float32Array, source_distance: Float32Array, limit: int) -> IntArray:
-    """Rows with the largest support; one beaten by a neighbour within the threshold counts half.
+    """Rows with the largest support, and a quarter of the limit spread evenly over all others.
 
-    The halving spreads the seeds, so that a dense bundle of wrong matches does not take all of them.
+    One beaten by a neighbour within the threshold counts half, so that a dense bundle of wrong matches does
+    not take all places; the spread quarter gives a second, weaker motion its proposals.
     """
     if len(support) <= limit:
         return np.arange(len(support))
     beaten = ((source_distance < 1.0) & (support[None, :] > support[:, None])).any(1)
     strength = np.where(beaten, 0.5 * support, support)
-    return np.argsort(-strength, kind="stable")[:limit]
+    order = np.argsort(-strength, kind="stable")
+    strongest = limit - limit // 4
+    rest = order[strongest:]
+    spread_rows = rest[np.linspace(0, len(rest) - 1, limit // 4).astype(np.int64)]
+    return np.concatenate([order[:strongest], spread_rows])
 
 
 def local_sets(

@@ -8,9 +8,7 @@ second.
 from __future__ import annotations
 
 import os
-import secrets
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,6 +21,7 @@ from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import FormatError, InputError, NonFiniteError, OutputError
+from geomoe3d.files import write_atomically
 from geomoe3d.types import FloatArray
 
 _CLOUD_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
@@ -86,30 +85,14 @@ def _check_place(path: Path, force: bool, suffixes: tuple[str, ...]) -> None:
         raise OutputError(f"cannot write '{path}': the folder '{folder}' may not be written to")
 
 
-@contextmanager
-def replacing(path: Path, force: bool) -> Iterator[BinaryIO]:
-    """A binary file that takes the name ``path`` when the block ends well and vanishes when it does not.
+def _write(path: Path, fill: Callable[[BinaryIO], None], force: bool) -> None:
+    """Let ``fill`` write a binary file that takes the name ``path`` only when it is whole."""
 
-    A symbolic link is followed, so its target is replaced.
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as handle:
+            fill(handle)
 
-    Raises:
-        OutputError: the disk refuses, or the file appeared meanwhile and ``force`` is not given.
-    """
-    final = path.resolve()
-    temporary = final.parent / f".{final.name}.{secrets.token_hex(4)}.tmp"
-    try:
-        try:
-            with temporary.open("x+b") as handle:
-                yield handle
-            if final.exists() and not force:
-                raise OutputError(f"'{path}' exists; pass --force (force=True in Python) to replace it")
-            temporary.replace(final)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OutputError:
-        raise
-    except OSError as error:
-        raise OutputError(f"cannot write '{path}': {error.strerror or error}") from None
+    write_atomically(path, write, force=force)
 
 
 def save_points(
@@ -162,8 +145,7 @@ def save_points(
         )
     if path.suffix.lower() == ".npy" and (normals is not None or colors is not None):
         raise FormatError(f"'{path}': NPY holds points only; choose .npz or .ply for normals and colours")
-    with replacing(path, force) as handle:
-        _CLOUD_WRITERS[path.suffix.lower()](handle, cloud)
+    _write(path, lambda handle: _CLOUD_WRITERS[path.suffix.lower()](handle, cloud), force)
 
 
 def save_aligned(
@@ -201,7 +183,8 @@ def save_aligned(
         )
     if not as_mesh and is_sampled(source, raw):
         raw = RawCloud(meshes.sample_surface(raw, 100_000, 0, what))
-    with replacing(path, force) as handle:
+
+    def fill(handle: BinaryIO) -> None:
         if as_mesh and suffix == ".glb":
             meshes.write_glb(handle, meshes.scene_of(source, raw), T)
         elif as_mesh:
@@ -209,6 +192,8 @@ def save_aligned(
         else:
             cloud = _moved(raw, T)
             _CLOUD_WRITERS[suffix](handle, RawCloud(cloud.points, cloud.normals, cloud.colors))
+
+    _write(path, fill, force)
 
 
 def _moved(raw: RawCloud, T: FloatArray) -> RawCloud:

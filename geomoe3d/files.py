@@ -92,7 +92,7 @@ def _move(temporary: Path, path: Path, *, force: bool) -> None:
             return
         except FileExistsError:
             raise OutputError(
-                f"'{path}' exists now, it appeared while being written; pass --force (force=True) to replace it, "
+                f"'{path}' exists now, it appeared meanwhile; pass --force (force=True) to replace it, "
                 "or another name"
             ) from None
         except (OSError, NotImplementedError, AttributeError):

@@ -266,7 +266,7 @@ def test_an_unknown_key_names_the_nearest(tmp_path):
 # ---- the order of imports -----------------------------------------------------------------------------
 
 ORDER = [
-    {"errors", "types", "files", "config", "config_text", "machine", "doctor"},
+    {"errors", "types", "files", "journal", "provenance", "workers", "config", "config_text", "machine", "doctor"},
     {"geometry", "result", "transform_files"},
     {"clouds"},
     {"filters", "estimators", "data"},

@@ -260,14 +260,26 @@ def iterate_fixed_correspondences(
     if not files:
         raise InputError(f"'{folder}' holds no .npz file")
     for file in files:
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                pair, start, T = archive["pair"], archive["start"], archive["T_target_source"]
-                rows = np.hstack([archive["source_mm"], archive["target_mm"]]) / 1000.0
-        except (OSError, ValueError, EOFError, KeyError) as error:
-            raise FormatError(f"'{file}' is no file of fixed correspondences: {error}") from None
-        for k, (i, j) in enumerate(pair):
-            yield FixedCorrespondences(file.stem, int(i), int(j), rows[start[k] : start[k + 1]], T[k])
+        yield from load_fixed_scene(file)
+
+
+def load_fixed_scene(file: str | Path) -> list[FixedCorrespondences]:
+    """The fixed correspondences of one scene, ``<scene>.npz``, pairs in gt.log order.
+
+    Raises:
+        FormatError: the file is missing, lacks an array or cannot be decoded.
+    """
+    file = Path(file)
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            pair, start, T = archive["pair"], archive["start"], archive["T_target_source"]
+            rows = np.hstack([archive["source_mm"], archive["target_mm"]]) / 1000.0
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise FormatError(f"'{file}' is no file of fixed correspondences: {error}") from None
+    return [
+        FixedCorrespondences(file.stem, int(i), int(j), rows[start[k] : start[k + 1]], T[k])
+        for k, (i, j) in enumerate(pair)
+    ]
 
 
 def _benchmark_folder(parent: Path, benchmark: str) -> Path:

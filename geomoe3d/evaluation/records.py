@@ -43,7 +43,7 @@ class EvaluationPair:
     source: Path
     target: Path
     T_target_source: FloatArray | None
-    raw_T_target_source: FloatArray | None = None
+    raw_T_target_source: FloatArray | None = None  # noqa: N815
     overlap: float | None = None
     information: FloatArray | None = None
     consecutive: bool = False

@@ -7,15 +7,14 @@ says with which configuration, data and source revision it was made.
 from __future__ import annotations
 
 import os
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from geomoe3d import __version__
 from geomoe3d.errors import CheckpointError
 from geomoe3d.files import write_atomically
+from geomoe3d.provenance import source_commit
 from geomoe3d.training.config import FREE_KEYS, TrainConfig
 
 _FORMAT = "geomoe3d-checkpoint"
@@ -74,18 +73,6 @@ def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: 
         )
     if state["data"] != data:
         raise CheckpointError(f"'{path}' was trained on other data: {state['data']}, now {data}")
-
-
-def source_commit() -> str:
-    """Revision of the source that runs, or the version of an installed package."""
-    try:
-        root = Path(__file__).resolve().parents[2]
-        if not (root / ".git").exists():
-            return f"geomoe3d {__version__}"
-        command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return f"geomoe3d {__version__}"
 
 
 def _differences(a: dict[str, Any], b: dict[str, Any], prefix: str = "") -> list[str]:

@@ -22,8 +22,9 @@ from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
 from geomoe3d.files import write_atomically
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.provenance import source_commit
 from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples
-from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint, source_commit
+from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.distributed import Process, choose_device, join
 from geomoe3d.training.logs import draw_curves

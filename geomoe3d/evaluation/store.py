@@ -1,0 +1,218 @@
+"""The cache of predictions: one folder per run, guarded by what the run depends on.
+
+``<study>/<label>/run.json`` says what the predictions come from, ``predictions.jsonl`` holds them, one line
+per pair. A run is only ever continued with the very same identity: settings, method, code, input. Weights are
+stored in half precision and label sets as bits: about 3 kB per pair of 1,000 correspondences.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
+from geomoe3d.files import write_atomically
+from geomoe3d.journal import Journal, read_journal
+from geomoe3d.types import BoolArray, FloatArray
+
+RUN_FILE = "run.json"
+PREDICTIONS_FILE = "predictions.jsonl"
+
+
+def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
+    """The journal of a run, and the pairs that it holds already; the folder is made if missing.
+
+    Raises:
+        InputError: the folder holds predictions of another identity; names what differs.
+        OutputError: the folder or its files cannot be written, or another process writes them.
+        FormatError: a file in it is damaged.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    if (folder / RUN_FILE).is_file():
+        differing = _differences(read_info(folder), info)
+        if differing:
+            raise InputError(
+                f"'{folder}' holds predictions of another run; they differ in {'; '.join(differing)}. "
+                "Give another folder or label, or --fresh to predict again"
+            )
+    else:
+        text = json.dumps(asdict(info), indent=2)
+        write_atomically(folder / RUN_FILE, lambda path: _put(path, text), force=False)
+    journal = Journal(folder / PREDICTIONS_FILE)
+    try:
+        done = {str(record.get("pair")) for record in read_journal(journal.path)}
+    except BaseException:
+        journal.close()
+        raise
+    return journal, done
+
+
+def remove_run(folder: Path) -> None:
+    """Delete the predictions of a run and what it says of itself; nothing else in the folder is touched.
+
+    Raises:
+        OutputError: a file cannot be removed.
+    """
+    for name in (PREDICTIONS_FILE, RUN_FILE):
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot remove '{folder / name}': {error.strerror}") from None
+
+
+def find_runs(study: Path) -> list[Path]:
+    """Folders of the runs in a study: itself, or those inside it, by name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if (study / RUN_FILE).is_file():
+        return [study]
+    found = sorted(path.parent for path in study.glob(f"*/{RUN_FILE}")) if study.is_dir() else []
+    if not found:
+        raise InputError(
+            f"'{study}' holds no predictions ({RUN_FILE}); `geomoe3d evaluate predict` makes them"
+        )
+    return found
+
+
+def read_info(folder: Path) -> RunInfo:
+    """What a run says of itself.
+
+    Raises:
+        FormatError: run.json is damaged.
+    """
+    path = folder / RUN_FILE
+    try:
+        return RunInfo(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise FormatError(f"'{path}' does not describe a run: {error}") from None
+
+
+def read_predictions(folder: Path) -> list[Prediction]:
+    """The predictions of a run; of a pair that was written twice, the first.
+
+    Raises:
+        FormatError: a line is damaged; names it.
+    """
+    predictions: dict[str, Prediction] = {}
+    path = folder / PREDICTIONS_FILE
+    for number, record in enumerate(read_journal(path), start=1):
+        try:
+            prediction = decode(record)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FormatError(f"'{path}' line {number} is no prediction: {error!r}") from None
+        predictions.setdefault(prediction.pair, prediction)
+    return list(predictions.values())
+
+
+def encode(prediction: Prediction) -> dict[str, Any]:
+    """A prediction as JSON; infinite or NaN motions are no motion."""
+    labels = prediction.labels
+    return {
+        "pair": prediction.pair,
+        "T": _matrix(prediction.T_target_source),
+        "confidence": prediction.confidence,
+        "status": prediction.status,
+        "hypotheses": [_matrix(T) for T in prediction.hypotheses],
+        "labels": None
+        if labels is None
+        else {
+            "count": len(labels.true),
+            "true": _bits(labels.true),
+            "kept": None if labels.kept is None else _bits(labels.kept),
+            "verified": _bits(labels.verified),
+        },
+        "weights": None if prediction.weights is None else _halves(prediction.weights),
+        "seconds": prediction.seconds,
+        "stages": prediction.stages,
+        "peak_memory": prediction.peak_memory,
+        "error": prediction.error,
+    }
+
+
+def decode(record: dict[str, Any]) -> Prediction:
+    """Inverse of `encode`.
+
+    Raises:
+        KeyError, TypeError, ValueError: the record is no prediction.
+    """
+    stored = record["labels"]
+    labels = None
+    if stored is not None:
+        count = int(stored["count"])
+        kept = None if stored["kept"] is None else _from_bits(stored["kept"], count)
+        labels = Labels(_from_bits(stored["true"], count), kept, _from_bits(stored["verified"], count))
+    weights = record["weights"]
+    return Prediction(
+        pair=str(record["pair"]),
+        T_target_source=_from_matrix(record["T"]),
+        confidence=record["confidence"],
+        status=record["status"],
+        hypotheses=tuple(T for T in map(_from_matrix, record["hypotheses"]) if T is not None),
+        labels=labels,
+        weights=None
+        if weights is None
+        else np.frombuffer(base64.b64decode(weights), dtype="<f2").astype(np.float64),
+        seconds=float(record["seconds"]),
+        stages=dict(record["stages"]),
+        peak_memory=record["peak_memory"],
+        error=record["error"],
+    )
+
+
+def _matrix(T: FloatArray | None) -> list[float] | None:
+    return None if T is None or not np.isfinite(T).all() else [float(value) for value in np.ravel(T)]
+
+
+def _from_matrix(values: list[float] | None) -> FloatArray | None:
+    return None if values is None else np.array(values, dtype=np.float64).reshape(4, 4)
+
+
+def _bits(mask: BoolArray) -> str:
+    return base64.b64encode(np.packbits(mask).tobytes()).decode("ascii")
+
+
+def _from_bits(text: str, count: int) -> BoolArray:
+    packed = np.frombuffer(base64.b64decode(text), dtype=np.uint8)
+    return np.unpackbits(packed, count=count).astype(np.bool_)
+
+
+def _halves(weights: FloatArray) -> str:
+    return base64.b64encode(np.asarray(weights).astype("<f2").tobytes()).decode("ascii")
+
+
+def _differences(stored: RunInfo, wanted: RunInfo) -> list[str]:
+    """What decides predictions and differs, in words. Commit, hardware and time are told, not compared."""
+    old = {"method": stored.method, "track": stored.track, "benchmark": stored.benchmark, "seed": stored.seed}
+    new = {"method": wanted.method, "track": wanted.track, "benchmark": wanted.benchmark, "seed": wanted.seed}
+    pairs = {**_flat(old), **_flat(stored.identity)}, {**_flat(new), **_flat(wanted.identity)}
+    keys = sorted(pairs[0].keys() | pairs[1].keys())
+    return [
+        f"{key} ({pairs[0].get(key)} there, {pairs[1].get(key)} now)"
+        for key in keys
+        if pairs[0].get(key) != pairs[1].get(key)
+    ]
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    rows: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            rows.update(_flat(value, f"{prefix}{key}."))
+        else:
+            rows[prefix + key] = json.dumps(value, sort_keys=True)
+    return rows
+
+
+def _put(path: Path, text: str) -> None:
+    path.write_text(text + "\n", encoding="utf-8")

@@ -68,6 +68,8 @@ class Journal:
             self._stream: IO[bytes] = self.path.open("a+b")
             _lock(self._stream, self.path)
             _cut_torn_line(self._stream)
+        except OutputError:
+            raise
         except OSError as error:
             raise OutputError(f"cannot write '{self.path}': {error.strerror}") from None
         self._synced = time.monotonic()

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -34,6 +31,7 @@ def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None
 
     Exit code 0 when every listed pair can be used, else 2.
     """
+    from geomoe3d.cli.terminal import progress_bar
     from geomoe3d.data.check import check_folder
 
     with progress_bar("fragments", quiet=as_json) as advance:
@@ -60,48 +58,6 @@ def _print(report: CheckReport) -> None:
         for line in lines:
             click.echo(f"{title}: {line}")
     click.echo("usable" if report.usable else "not usable as it is")
-
-
-@contextmanager
-def progress_bar(unit: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """A bar with count and time left on stderr; a line now and then where stderr is no terminal.
-
-    Yields:
-        Call it with (done, all).
-    """
-    if quiet:
-        yield lambda done, total: None
-        return
-    if not sys.stderr.isatty():
-        yield _lines(unit)
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn(unit), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(unit, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _lines(unit: str) -> Callable[[int, int], None]:
-    import time
-
-    start = said = time.monotonic()
-    first: list[int] = []
-
-    def say(done: int, total: int) -> None:
-        nonlocal said
-        first.append(done) if not first else None
-        now = time.monotonic()
-        if now - said < 15 and done < total:
-            return
-        said = now
-        rate = (done - first[0]) / max(now - start, 1e-9)
-        left = f", about {(total - done) / rate:.0f} s left" if rate > 0 and done < total else ""
-        click.echo(f"{done} of {total} {unit}{left}", err=True)
-
-    return say
 
 
 @command.command(context_settings=HELP)
@@ -144,7 +100,7 @@ def fragments(
     FRAMES holds frame-*.depth.png with *.pose.txt (7-Scenes, 3DMatch), depth.txt with groundtruth.txt (TUM),
     or depth/*.png with poses.txt. Poses are camera to world. Unusable frames are named and skipped.
     """
-    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
     from geomoe3d.data.fragments import make_fragments
     from geomoe3d.data.fusion import THREEDMATCH_VOLUME, FusionSettings
     from geomoe3d.data.rgbd import open_recording
@@ -223,7 +179,7 @@ def synthesize(
     """
     from pathlib import Path
 
-    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
     from geomoe3d.config import build_config, read_yaml, set_keys
     from geomoe3d.data.contact import draw_contact_sheet
     from geomoe3d.data.report import report_text, write_report
@@ -271,7 +227,7 @@ def features(
     ROOT is any folder that 'geomoe3d data check' knows. Started again, it goes on; a shard that no longer
     fits its fragments or settings is refused. Train with data.train=OUT.
     """
-    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
     from geomoe3d.data.describe import describe_collection
 
     with stdout_to_stderr(), progress_bar("scenes", quiet=False) as advance:

@@ -1,13 +1,12 @@
 """Stage one: every method on every pair, each finished prediction kept at once.
 
-All methods see a pair one after the other, on the same input, so that the ratio of their times holds on a busy
-machine. Killed at any moment and started again, it goes on with what is missing. The truth is used for one
-thing only: to label the correspondences that a method weighed, after it has answered.
+All methods see a pair one after the other, on the same input, so that the ratio of their times holds on a
+busy machine. Killed at any moment and started again, it goes on with what is missing. The truth is used for
+one thing only: to label the correspondences that a method weighed, after it has answered.
 """
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -19,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, load_pairs, thin_out
 from geomoe3d.evaluation.memory import PeakMemory
 from geomoe3d.evaluation.methods import make_method
 from geomoe3d.evaluation.records import (
@@ -31,7 +29,8 @@ from geomoe3d.evaluation.records import (
     Prediction,
     RunInfo,
 )
-from geomoe3d.evaluation.store import encode, open_run, read_info, remove_run
+from geomoe3d.evaluation.store import encode, open_run, remove_run
+from geomoe3d.evaluation.task import Task, fingerprint
 from geomoe3d.evaluation.tracks import InputMaker, needs
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.journal import Journal
@@ -53,31 +52,6 @@ class MethodSpec:
     spec: str
     assignments: tuple[str, ...] = ()
     label: str | None = None
-
-
-@dataclass(frozen=True)
-class Task:
-    """What a set of predictions is made on.
-
-    Attributes:
-        benchmark: as in `load_pairs`.
-        track: as in `geomoe3d.evaluation.tracks`.
-        root: folder of the published benchmarks, or None.
-        every: every n-th pair.
-        num_unrelated: pairs of the benchmark ``unrelated``.
-        seed: of the methods.
-    """
-
-    benchmark: str
-    track: str
-    root: str | None = None
-    every: int = 1
-    num_unrelated: int = NUM_UNRELATED
-    seed: int = 0
-
-    def pairs(self) -> list[EvaluationPair]:
-        """The pairs, in the benchmark's order."""
-        return thin_out(load_pairs(self.benchmark, self.root, num_unrelated=self.num_unrelated), self.every)
 
 
 @dataclass(frozen=True)
@@ -180,24 +154,6 @@ def run_name(spec: MethodSpec, task: Task) -> str:
     return "".join(c if c.isalnum() or c in "._-+" else "_" for c in name)
 
 
-def load_run_pairs(folder: Path) -> list[EvaluationPair]:
-    """The pairs that a stored run was made on, with their truth, read again from the benchmark.
-
-    Raises:
-        InputError: the benchmark is not there any more, or its ground truth is another than the run saw.
-    """
-    info = read_info(folder)
-    given = info.identity["pairs"]
-    task = Task(given["benchmark"], info.track, given["root"], given["every"], given["num_unrelated"])
-    pairs = task.pairs()
-    if _fingerprint(pairs) != given["fingerprint"]:
-        raise InputError(
-            f"the ground truth of '{info.benchmark}' is not the one that '{folder}' was predicted on; "
-            "set GEOMOE3D_DATA to the same data, or predict again with --fresh"
-        )
-    return pairs
-
-
 def _info(
     spec: MethodSpec, method: Method, task: Task, pairs: list[EvaluationPair], workers: int, command: str
 ) -> RunInfo:
@@ -210,7 +166,7 @@ def _info(
             "root": task.root,
             "every": task.every,
             "num_unrelated": task.num_unrelated,
-            "fingerprint": _fingerprint(pairs),
+            "fingerprint": fingerprint(pairs),
         },
         "workers": workers,
         "threads": _threads(workers),
@@ -229,16 +185,6 @@ def _info(
         workers=workers,
         threads=_threads(workers),
     )
-
-
-def _fingerprint(pairs: list[EvaluationPair]) -> str:
-    """Hash of the pairs' names and true motions."""
-    digest = hashlib.sha256()
-    for pair in pairs:
-        digest.update(pair.id.encode())
-        if pair.T_target_source is not None:
-            digest.update(np.round(pair.T_target_source, 9).astype("<f8").tobytes())
-    return digest.hexdigest()[:16]
 
 
 def _threads(workers: int) -> int:

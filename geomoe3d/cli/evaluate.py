@@ -1,0 +1,221 @@
+"""``geomoe3d evaluate``: predict into a cache, score it, compare two runs."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
+
+if TYPE_CHECKING:
+    from geomoe3d.evaluation.study import StudiedRun
+
+
+@click.group(context_settings=HELP)
+def command() -> None:
+    """Measure filters, estimators and whole systems on benchmarks, in the field's own terms."""
+
+
+def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    for option in reversed(
+        (
+            click.argument("study", metavar="OUT", type=click.Path(file_okay=False)),
+            click.option(
+                "--method",
+                "methods",
+                metavar="NAME",
+                multiple=True,
+                required=True,
+                help="See `evaluate methods`; FILE.py:FUNCTION is your own. Repeatable.",
+            ),
+            click.option(
+                "--benchmark",
+                "benchmarks",
+                metavar="NAME",
+                multiple=True,
+                default=("3DMatch",),
+                show_default=True,
+                help="3DMatch, 3DLoMatch, unrelated, or a folder. Repeatable.",
+            ),
+            click.option(
+                "--track",
+                metavar="NAME",
+                default="clouds",
+                show_default=True,
+                help="1k or all: fixed correspondences; clouds: end to end.",
+            ),
+            click.option("--every", default=1, show_default=True, help="Every n-th pair only."),
+            click.option(
+                "--unrelated",
+                "num_unrelated",
+                default=200,
+                show_default=True,
+                help="Pairs of the benchmark unrelated.",
+            ),
+            click.option(
+                "--set",
+                "assignments",
+                metavar="KEY=VALUE",
+                multiple=True,
+                help="Configuration of the method geomoe3d; repeatable.",
+            ),
+            click.option("--label", help="What to call the run, where there is one method. [its name]"),
+            click.option("--data", "root", metavar="FOLDER", help="Of the benchmarks. [GEOMOE3D_DATA]"),
+            click.option("--workers", default=1, show_default=True, help="Processes over pairs."),
+            click.option("--seed", default=0, show_default=True, help="Same seed, same predictions."),
+            click.option("--fresh", is_flag=True, help="Remove what these runs hold and predict again."),
+        )
+    ):
+        function = option(function)
+    return function
+
+
+@command.command(context_settings=HELP)
+@_prediction_options
+@traceback_option
+def predict(**given: Any) -> None:
+    """Let methods register the pairs of benchmarks and keep what they say in OUT.
+
+    Every method sees each pair in turn, on the same input. A run that was interrupted goes on; predictions
+    of other settings, code or input are refused, never mixed.
+    """
+    _predict(**given)
+
+
+@command.command(context_settings=HELP)
+@_prediction_options
+@traceback_option
+def run(**given: Any) -> None:
+    """Predict, score, and write OUT/report.html, report.md and report.json (replaced each time)."""
+    from geomoe3d.evaluation.study import write_report
+
+    _predict(**given)
+    study = Path(given["study"])
+    runs = _score(study, raw=False)
+    _print_table(runs)
+    for suffix in (".html", ".md", ".json"):
+        write_report(study / f"report{suffix}", runs, force=True)
+    click.echo(f"report: {study / 'report.html'}")
+
+
+@command.command(context_settings=HELP)
+@click.argument("study", metavar="OUT", type=click.Path(file_okay=False))
+@click.option("--raw", is_flag=True, help="Rotations of the truth as published, not projected onto SO(3).")
+@click.option(
+    "--report",
+    "reports",
+    metavar="FILE",
+    multiple=True,
+    help="Write a report: .html, .md or .json; repeatable.",
+)
+@click.option("--force", is_flag=True, help="Replace reports that exist.")
+@click.option("--quiet", is_flag=True, help="Print no table.")
+@traceback_option
+def score(study: str, raw: bool, reports: tuple[str, ...], force: bool, quiet: bool) -> None:
+    """Score the predictions in OUT: recall, errors, precision and recall of inliers, time, calibration."""
+    from geomoe3d.errors import InputError
+    from geomoe3d.evaluation.study import REPORT_SUFFIXES, write_report
+    from geomoe3d.files import check_output
+
+    for report in reports:
+        if Path(report).suffix not in REPORT_SUFFIXES:
+            raise InputError(f"cannot write '{report}': a report is {', '.join(REPORT_SUFFIXES)}")
+        check_output(report, force=force)
+    runs = _score(Path(study), raw=raw)
+    if not quiet:
+        _print_table(runs)
+    for report in reports:
+        write_report(report, runs, force=force)
+
+
+@command.command(context_settings=HELP)
+@click.argument("first", metavar="RUN", type=click.Path(file_okay=False))
+@click.argument("second", metavar="RUN", type=click.Path(file_okay=False))
+@traceback_option
+def compare(first: str, second: str) -> None:
+    """Compare two runs pair by pair: who is right where, McNemar's test, ratio of the times."""
+    from geomoe3d.errors import InputError
+    from geomoe3d.evaluation.compare import compare as compare_scores
+    from geomoe3d.evaluation.report_text import comparison_text
+
+    runs = [_score(Path(folder), raw=False) for folder in (first, second)]
+    for folder, found in zip((first, second), runs, strict=True):
+        if len(found) != 1:
+            raise InputError(f"'{folder}' holds {len(found)} runs; give the folder of one of them")
+    click.echo(comparison_text(compare_scores(runs[0][0].score, runs[1][0].score)))
+
+
+@command.command(context_settings=HELP)
+@traceback_option
+def methods() -> None:
+    """List the methods, what each can be given, and which are not installed."""
+    from geomoe3d.evaluation.methods import make_method, method_names
+
+    for name in method_names():
+        method = make_method(name)
+        reason = method.absent()
+        click.echo(
+            f"{name:24} {', '.join(sorted(method.inputs)):26} {'' if reason is None else reason}".rstrip()
+        )
+
+
+def _predict(
+    study: str,
+    methods: tuple[str, ...],
+    benchmarks: tuple[str, ...],
+    track: str,
+    every: int,
+    num_unrelated: int,
+    assignments: tuple[str, ...],
+    label: str | None,
+    root: str | None,
+    workers: int,
+    seed: int,
+    fresh: bool,
+) -> None:
+    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.errors import InputError
+    from geomoe3d.evaluation.predict import MethodSpec, predict
+    from geomoe3d.evaluation.task import Task
+
+    if label is not None and len(methods) != 1:
+        raise InputError(f"--label names one run, but {len(methods)} methods are given; give one method")
+    if assignments and "geomoe3d" not in methods:
+        raise InputError("--set is for the method geomoe3d, which is not among those given")
+    specs = [MethodSpec(name, assignments if name == "geomoe3d" else (), label) for name in methods]
+    made = absent = 0
+    for benchmark in benchmarks:
+        task = Task(benchmark, track, root, every, num_unrelated, seed)
+        with stdout_to_stderr(), progress_bar("predictions", quiet=False) as advance:
+            report = predict(
+                study, specs, task, workers=workers, fresh=fresh, command=_command_line(), progress=advance
+            )
+        for name, reason in report.absent.items():
+            click.echo(f"absent: {name}: {reason}", err=True)
+        made, absent = made + report.made + report.kept, len(report.absent)
+    if not made:
+        click.echo("nothing was predicted", err=True)
+        click.get_current_context().exit(BAD_INPUT if absent else 0)
+
+
+def _score(study: Path, *, raw: bool) -> list[StudiedRun]:
+    from geomoe3d.cli.terminal import progress_bar
+    from geomoe3d.evaluation.study import score_study
+
+    with progress_bar("runs", quiet=not sys.stderr.isatty()) as advance:
+        return score_study(study, raw_truth=raw, progress=advance)
+
+
+def _print_table(runs: list[StudiedRun]) -> None:
+    from geomoe3d.evaluation.report_text import print_table
+
+    print_table([run.score for run in runs])
+
+
+def _command_line() -> str:
+    return shlex.join(["geomoe3d", *sys.argv[1:]])

@@ -76,7 +76,7 @@ def acceptance(
     right = np.array([score.right for score in scores], dtype=np.bool_)
     measures = measure_all(
         {
-            "accepted": Quantity(100.0 * accepted, "%"),
+            "accepted": Quantity(_percent_of(accepted, np.ones_like(accepted)), "%"),
             "accepted_right": Quantity(_percent_of(right, accepted), "%"),
         },
         [score.scene for score in scores],
@@ -116,15 +116,15 @@ def auroc_of(confidence: FloatArray, right: BoolArray) -> Statistic:
     values, group = np.unique(confidence, return_inverse=True)
     order = np.argsort(group.reshape(-1), kind="stable")
     starts = np.searchsorted(group.reshape(-1)[order], np.arange(len(values)))
-    right_in_order = right[order].astype(np.float64)
+    right_in_order = right[order].astype(np.float64)[:, None]
 
     def statistic(counts: FloatArray) -> FloatArray:
-        ordered = counts[:, order]
-        rights = np.add.reduceat(ordered * right_in_order, starts, axis=1)
-        wrongs = np.add.reduceat(ordered * (1.0 - right_in_order), starts, axis=1)
-        below = np.cumsum(wrongs, axis=1) - wrongs
-        wins = (rights * (below + 0.5 * wrongs)).sum(axis=1)
-        contests = rights.sum(axis=1) * wrongs.sum(axis=1)
+        ordered = counts.T[order]
+        rights = np.add.reduceat(ordered * right_in_order, starts, axis=0)
+        wrongs = np.add.reduceat(ordered * (1.0 - right_in_order), starts, axis=0)
+        below = np.cumsum(wrongs, axis=0) - wrongs
+        wins = (rights * (below + 0.5 * wrongs)).sum(axis=0)
+        contests = rights.sum(axis=0) * wrongs.sum(axis=0)
         area: FloatArray = np.divide(wins, contests, out=np.full(len(counts), np.nan), where=contests > 0)
         return area
 
@@ -152,7 +152,7 @@ def risk_coverage(confidence: FloatArray, right: BoolArray, total: int) -> tuple
 
 
 def _percent_of(right: BoolArray, accepted: BoolArray) -> FloatArray:
-    values = np.full(len(right), np.nan)
+    values: FloatArray = np.full(len(right), np.nan)
     values[accepted] = 100.0 * right[accepted]
     return values
 

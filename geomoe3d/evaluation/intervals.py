@@ -159,19 +159,42 @@ def quantile(values: FloatArray, counts: FloatArray, q: float) -> FloatArray:
     if rows.size == 0:
         return np.full(len(counts), np.nan)
     ordered = values[rows]
-    upto = np.cumsum(counts[:, rows], axis=1)
-    total = upto[:, -1]
+    columns = counts.T[rows]
+    draws = _SortedDraws(columns)
+    total = draws.upto[-1]
     position = q * np.maximum(total - 1.0, 0.0)
     # Sums of products such as 0.9 x 10 must not fall a last bit short of the whole number they are.
     position = np.where(np.abs(position - np.rint(position)) < 1e-9, np.rint(position), position)
     below = np.floor(position)
-    last = rows.size - 1
-    low = ordered[np.minimum((upto <= below[:, None]).sum(axis=1), last)]
-    high = ordered[np.minimum((upto <= below[:, None] + 1.0).sum(axis=1), last)]
+    low, high = ordered[draws.row_of(below)], ordered[draws.row_of(below + 1.0)]
     share = position - below
     with np.errstate(invalid="ignore"):
         between = np.where((share == 0.0) | (low == high), low, low + share * (high - low))
     return np.where(total > 0, between, np.nan)
+
+
+class _SortedDraws:
+    """Finds order statistics in counts (m, B) of sorted values: first the block of rows, then the row in it.
+
+    A fifth of the time of cumulative sums over all rows.
+    """
+
+    _STEP = 40
+
+    def __init__(self, columns: FloatArray):
+        self.columns = columns
+        self.sums = np.add.reduceat(columns, np.arange(0, len(columns), self._STEP), axis=0)
+        self.upto = np.cumsum(self.sums, axis=0)
+
+    def row_of(self, k: FloatArray) -> IntArray:
+        """(B,) row of the k-th smallest draw (k (B,) from 0) of every resample; the last for k beyond all."""
+        resample = np.arange(self.columns.shape[1])
+        block = np.minimum((self.upto <= k).sum(axis=0), len(self.upto) - 1)
+        before = self.upto[block, resample] - self.sums[block, resample]
+        rows = np.minimum(block * self._STEP + np.arange(self._STEP)[:, None], len(self.columns) - 1)
+        inside = before + np.cumsum(self.columns[rows, resample], axis=0)
+        found: IntArray = np.minimum(block * self._STEP + (inside <= k).sum(axis=0), len(self.columns) - 1)
+        return found
 
 
 class _Evaluator:
@@ -213,7 +236,7 @@ class _Evaluator:
             scene_counts @ np.where(there, rates, 0.0), scene_counts @ there.astype(np.float64)
         ).T
         if self.others:
-            counts = scene_counts[:, self.labels]
+            counts = scene_counts.T[self.labels].T
             for k in self.others:
                 found[k] = self._other(k, counts)
         return found
@@ -247,9 +270,9 @@ def _draws(size: int, width: int, resamples: int, rng: np.random.Generator) -> I
     block = max(1, _BLOCK // max(width, size))
     for first in range(0, resamples, block):
         rows = min(block, resamples - first)
-        drawn = rng.integers(size, size=(rows, size)) + size * np.arange(rows)[:, None]
-        counts = np.bincount(drawn.ravel(), minlength=rows * size).reshape(rows, size)
-        yield counts.astype(np.float64)
+        drawn = rng.integers(size, size=(rows, size)) * rows + np.arange(rows)[:, None]
+        counts = np.bincount(drawn.ravel(), minlength=rows * size).reshape(size, rows)
+        yield counts.astype(np.float64).T  # one pair after the other in memory, as quantiles want it
 
 
 def _is_degenerate(quantity: Quantity, value: float) -> bool:

@@ -19,6 +19,7 @@ from geomoe3d.evaluation.summary import title
 
 FORMAT = "geomoe3d evaluation 1"
 NATURAL_WIDTH = 118
+_SPLIT_WIDTH = 110
 _HEADINGS = (
     "recall\n15/0.30",
     "recall\n20/0.30",
@@ -44,7 +45,7 @@ def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, colo
 
     Args:
         scores: runs, in the order of the rows.
-        width: columns; None takes 118, which holds every column.
+        width: columns; None takes 118, which hold the whole table; below 110 it comes in two parts.
         color: True for terminal colours.
     """
     from rich.console import Console
@@ -55,15 +56,17 @@ def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, colo
     with console.capture() as captured:
         for (benchmark, track), runs in _groups(scores).items():
             console.print(Text(f"{benchmark}, track {track}", style="bold"))
-            table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-            table.add_column("run", overflow="fold")
-            for heading in _HEADINGS:
-                table.add_column(Text(heading), justify="right", no_wrap=True)
-            for run in runs:
-                cells = main_row(run)
-                cells[0] = f"{cells[0]}\n{_interval(run.measures.get('recall_15'), gap=' ')}".rstrip()
-                table.add_row(Text(f"{run.info.label}\n{_pairs(run)}"), *(Text(cell) for cell in cells))
-            console.print(table)
+            for columns in _columns(console.width):
+                table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+                table.add_column("run", overflow="fold")
+                for heading in _HEADINGS[columns]:
+                    table.add_column(Text(heading), justify="right", no_wrap=True)
+                for run in runs:
+                    cells = main_row(run)
+                    cells[0] = f"{cells[0]}\n{_interval(run.measures.get('recall_15'), gap=' ')}".rstrip()
+                    first = Text(f"{run.info.label}\n{_pairs(run)}")
+                    table.add_row(first, *(Text(cell) for cell in cells[columns]))
+                console.print(table)
             for run in runs:
                 for warning in warnings(run):
                     console.print(Text(f"WARNING: {warning}", style="bold red"))
@@ -149,6 +152,10 @@ def _groups(scores: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]
     for run in scores:
         groups.setdefault((run.info.benchmark, run.info.track), []).append(run)
     return groups
+
+
+def _columns(width: int) -> list[slice]:
+    return [slice(None)] if width >= _SPLIT_WIDTH else [slice(0, 6), slice(6, None)]
 
 
 def _pairs(run: RunScore) -> str:

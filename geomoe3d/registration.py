@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.answer import Findings, failed_result, finished_result
+from geomoe3d.clouds.description_cache import DescriptionCache
 from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.matching import match
@@ -26,6 +27,7 @@ from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter
+from geomoe3d.geometry.se3 import check_motion, shift_frames
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import refine
 from geomoe3d.result import RegistrationResult
@@ -75,13 +77,17 @@ class Registrar:
 
     Args:
         config: complete configuration; None takes the defaults.
+        cache: keeps described clouds, for clouds that are in many pairs; answers are the same without it.
 
     Raises:
         ConfigError: an unknown filter or estimator.
     """
 
-    def __init__(self, config: RegistrationConfig | None = None) -> None:
+    def __init__(
+        self, config: RegistrationConfig | None = None, *, cache: DescriptionCache | None = None
+    ) -> None:
         self.config = config or RegistrationConfig()
+        self._cache = cache
         self._filter: Filter = make_filter(self.config.filter.name, self.config.filter.weights)
         self._estimator: Estimator = make_estimator(self.config.estimator)
 
@@ -100,9 +106,16 @@ class Registrar:
         tree["filter"] = {"name": "geomoe", "weights": str(name_or_path)}
         return cls(build_config(RegistrationConfig, tree, "Registrar.from_pretrained"))
 
-    def register(self, source: Any, target: Any, *, progress: Progress | None = None) -> RegistrationResult:
+    def register(
+        self,
+        source: Any,
+        target: Any,
+        *,
+        initial: ArrayLike | None = None,
+        progress: Progress | None = None,
+    ) -> RegistrationResult:
         """The rigid motion that lays source on target; see `geomoe3d.register`."""
-        return self.explain(source, target, progress=progress).result
+        return self.explain(source, target, initial=initial, progress=progress).result
 
     def register_many(self, pairs: Iterable[tuple[Any, Any]]) -> Iterator[RegistrationResult]:
         """One result per (source, target), in order, as they are finished."""
@@ -124,7 +137,14 @@ class Registrar:
             raise InputError(f"correspondences must be finite numbers of shape (N, 6), found {rows.shape}")
         return self._filter(Correspondences(rows), voxel_size=voxel_size, seed=self.config.seed).weights
 
-    def explain(self, source: Any, target: Any, *, progress: Progress | None = None) -> Explanation:
+    def explain(
+        self,
+        source: Any,
+        target: Any,
+        *,
+        initial: ArrayLike | None = None,
+        progress: Progress | None = None,
+    ) -> Explanation:
         """`register` with the correspondences and weights behind the answer."""
         config, seed, clock = self.config, self.config.seed, StageClock(progress)
         clock("load")
@@ -138,15 +158,15 @@ class Registrar:
         wanted = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         threshold = config.estimator.inlier_threshold * voxel_size
-        prepared = self.prepare(*clouds, voxel_size)
-        clock("describe")
-        described = describe(prepared[0], config.preparation), describe(prepared[1], config.preparation)
+        described = self.describe(*clouds, voxel_size, clock)
         clock("match")
         matched = match(*described, config.matching, seed=seed)
         clock("weigh")
         weighed = self._filter(matched, voxel_size=voxel_size, seed=seed)
         clock("solve")
         hypotheses = self.solve(matched, weighed.weights, threshold)
+        if initial is not None:
+            hypotheses += self.guesses(initial, described)
         clock("verify")
         verifier = Verifier(*described, threshold, seed=seed)
         ranked = verifier.rank(hypotheses)
@@ -163,17 +183,38 @@ class Registrar:
         inliers = findings.residuals(matched) < threshold
         return Explanation(result, *clouds, matched, weighed, inliers)
 
-    def prepare(
-        self, source: PointCloud, target: PointCloud, voxel_size: float
+    def describe(
+        self, source: PointCloud, target: PointCloud, voxel_size: float, clock: StageClock
     ) -> tuple[PreparedCloud, PreparedCloud]:
-        """Both clouds on one voxel grid with normals turned by one rule."""
-        config = self.config.preparation
-        views = find_viewpoints(source, target, config.viewpoint)
-        made = [
-            prepare(cloud, voxel_size, config, viewpoint=view, seed=self.config.seed)
-            for cloud, view in zip((source, target), views, strict=True)
-        ]
-        return made[0], made[1]
+        """Both clouds on one voxel grid, with normals turned by one rule and features."""
+        views = find_viewpoints(source, target, self.config.preparation.viewpoint)
+        return (
+            self.describe_cloud(source, voxel_size, views[0], clock),
+            self.describe_cloud(target, voxel_size, views[1], clock),
+        )
+
+    def describe_cloud(
+        self, cloud: PointCloud, voxel_size: float, viewpoint: FloatArray | None, clock: StageClock
+    ) -> PreparedCloud:
+        """One cloud prepared and described, or as the cache holds it."""
+        config, seed = self.config.preparation, self.config.seed
+
+        def make() -> PreparedCloud:
+            clock("prepare")
+            prepared = prepare(cloud, voxel_size, config, viewpoint=viewpoint, seed=seed)
+            clock("describe")
+            return describe(prepared, config)
+
+        if self._cache is None:
+            return make()
+        return self._cache.fetch(cloud, voxel_size, viewpoint, config, seed=seed, make=make)
+
+    def guesses(self, initial: ArrayLike, described: tuple[PreparedCloud, PreparedCloud]) -> list[Hypothesis]:
+        """A user's first guess and its refinement as hypotheses among the others: verified, not trusted."""
+        source, target = described
+        T = shift_frames(check_motion(initial), -source.origin, -target.origin)
+        refined, _ = refine(T, source, target, self.config.refinement)
+        return [Hypothesis(motion, 0.0, 0) for motion in (T, refined)]
 
     def solve(self, matched: Correspondences, weights: FloatArray, threshold: float) -> list[Hypothesis]:
         """Hypotheses from all weighted correspondences, and from the mutual ones alone.
@@ -247,6 +288,7 @@ def register(
     target: Any,
     *,
     config: RegistrationConfig | None = None,
+    initial: ArrayLike | None = None,
     progress: Progress | None = None,
     **overrides: Any,
 ) -> RegistrationResult:
@@ -256,6 +298,8 @@ def register(
         source: path, (N, 3) array or tensor, Open3D or trimesh cloud or mesh, or `PointCloud`.
         target: likewise, in the same unit of length.
         config: complete configuration; None takes the defaults.
+        initial: (4, 4) a first guess in the files' coordinates, or None; it is verified against the clouds
+            beside the hypotheses found, not trusted.
         progress: called with the name of each stage as it begins.
         overrides: top-level configuration keys such as ``voxel_size=0.05`` or ``seed=1``.
 
@@ -263,13 +307,13 @@ def register(
         The answer with status, confidence and reasons; look at ``result.ok`` before using the transform.
 
     Raises:
-        InputError: a cloud that cannot be read or has too few usable points.
+        InputError: a cloud that cannot be read or has too few usable points, or a guess that is no motion.
         ConfigError: an unknown or invalid override.
     """
     if overrides:
         tree = (config or RegistrationConfig()).model_dump()
         config = build_config(RegistrationConfig, {**tree, **overrides}, "register(...)")
-    return Registrar(config).register(source, target, progress=progress)
+    return Registrar(config).register(source, target, initial=initial, progress=progress)
 
 
 def _load(data: Any, role: str, seed: int) -> PointCloud:

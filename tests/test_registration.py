@@ -274,7 +274,17 @@ def test_filter_weighs_anybodys_correspondences(pair):
 def test_progress_names_every_stage_in_order(pair):
     stages: list[str] = []
     geomoe3d.register(*pair[:2], progress=stages.append)
-    assert stages == ["load", "prepare", "describe", "match", "weigh", "solve", "verify", "refine", "judge"]
+    assert list(dict.fromkeys(stages)) == [
+        "load",
+        "prepare",
+        "describe",
+        "match",
+        "weigh",
+        "solve",
+        "verify",
+        "refine",
+        "judge",
+    ]
 
 
 def test_no_warnings_reach_the_user(pair):

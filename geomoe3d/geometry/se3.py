@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from geomoe3d.errors import InputError
 from geomoe3d.types import FloatArray
+
+_MOTION_TOLERANCE = 0.01  # published poses are up to 5e-4 off
 
 
 def make_transform(R: NDArray[np.floating[Any]], t: NDArray[np.floating[Any]]) -> FloatArray:
@@ -61,3 +64,29 @@ def shift_frames(T_local: FloatArray, source_origin: FloatArray, target_origin: 
     T: FloatArray = T_local.copy()
     T[:3, 3] = T_local[:3, 3] + target_origin - T_local[:3, :3] @ source_origin
     return T
+
+
+def check_motion(T: ArrayLike) -> FloatArray:
+    """A user's matrix as a rigid motion (4, 4), its rotation projected onto SO(3).
+
+    Raises:
+        InputError: another shape, non-finite numbers, a last row other than 0 0 0 1, or a linear part that
+            is no rotation: R^T R differs from the identity by more than 0.01, or it mirrors.
+    """
+    try:
+        matrix = np.array(T, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError("a motion must be a matrix of numbers of shape (4, 4)") from None
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"a motion must be 16 finite numbers of shape (4, 4), found shape {matrix.shape}")
+    R = matrix[:3, :3]
+    off = float(np.abs(R.T @ R - np.eye(3)).max())
+    if off > _MOTION_TOLERANCE or np.linalg.det(R) < 0:
+        what = "mirrors" if off <= _MOTION_TOLERANCE else f"is {off:.3g} off a rotation"
+        raise InputError(
+            f"the matrix is no rigid motion: its linear part {what} (at most {_MOTION_TOLERANCE}); scale and "
+            "shear are not estimated"
+        )
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputError(f"the last row of a motion must be 0 0 0 1, found {matrix[3].tolist()}")
+    return make_transform(project_to_so3(R), matrix[:3, 3])

@@ -79,7 +79,7 @@ def render_page(view: RegistrationView) -> str:
         "style": _part("page.css"),
         "draw_script": _part("page_draw.js"),
         "script": _part("page.js"),
-        "data": _embed(_data(view, scene)),
+        "data": embed_json(_data(view, scene)),
     }
     # One pass: a file name that holds {{data}} stays a file name.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], _part("page.html"))
@@ -275,7 +275,7 @@ def _base64_bytes(values: NDArray[np.float64]) -> str:
     return base64.b64encode(np.ascontiguousarray(levels).tobytes()).decode("ascii")
 
 
-def _embed(data: dict[str, Any]) -> str:
+def embed_json(data: dict[str, Any]) -> str:
     """JSON for the inside of a script element: no character in it can end the element or open another."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

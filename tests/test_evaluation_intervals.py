@@ -376,3 +376,19 @@ def test_unrelated_scans_accepted_by_mistake() -> None:
     assert nobody.value == 0.0
     assert nobody.interval == pytest.approx(wilson(0.0, 19))
     assert math.isnan(right.value) and right.count == 0
+
+
+def test_the_interval_of_the_calibration_error_is_reflected() -> None:
+    """Resampling only adds to the error of a nearly calibrated method; the interval goes the other way."""
+    rng = np.random.default_rng(6)
+    confidence = rng.random(300)
+    right = rng.random(300) < confidence
+    nothing, scenes, statistic = np.zeros(300), list("abc") * 100, calibration_error_of(confidence, right)
+    plain = measure_all({"": Quantity(nothing, "", statistic)}, scenes)[""]
+    reflected = measure_all({"": Quantity(nothing, "", statistic, reflected=True)}, scenes)[""]
+    value, (low, high) = plain.value, plain.interval
+    assert value < (low + high) / 2
+    assert reflected.value == value
+    assert reflected.interval == pytest.approx((max(0.0, 2 * value - high), 2 * value - low))
+    found = calibrate([scored(c, r, s) for c, r, s in zip(confidence, right, scenes, strict=True)])
+    assert found is not None and found.calibration_error == reflected

@@ -172,13 +172,9 @@ def agresti_min(a_only: int, b_only: int, count: int) -> Interval:
 
 def _notes(a: RunScore, b: RunScore, common: int) -> tuple[str, ...]:
     notes = []
-    alone = [
-        f"{len(run.pairs) - common} pairs were answered by '{run.info.label}' only"
-        for run in (a, b)
-        if len(run.pairs) > common
-    ]
+    alone = [f"'{run.info.label}' {len(run.pairs) - common:,}" for run in (a, b) if len(run.pairs) > common]
     if alone:
-        notes.append(f"{' and '.join(alone)}; they are left out.")
+        notes.append(f"Pairs answered by one run only are left out: {', '.join(alone)}.")
     for what, of_a, of_b in (
         ("hardware", a.info.hardware, b.info.hardware),
         ("number of workers", a.info.workers, b.info.workers),

@@ -257,7 +257,7 @@ class Measure:
 
     Attributes:
         value: NaN where nothing was counted.
-        unit: ``%``, ``deg``, ``cm``, ``ms``, ``MiB`` or empty.
+        unit: ``%``, ``points`` (of percent), ``deg``, ``cm``, ``ms``, ``MiB`` or empty.
         count: pairs that entered.
         interval: bootstrap over pairs; (NaN, NaN) where it is not defined.
         scene_interval: bootstrap over scenes, pairs with them; (NaN, NaN) for fewer than two scenes.

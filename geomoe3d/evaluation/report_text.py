@@ -139,8 +139,8 @@ def warnings(run: RunScore) -> list[str]:
     errors = sum(score.error is not None for score in run.pairs)
     if errors:
         found.append(
-            f"'{run.info.label}' ended with an error on {errors:,} of {len(run.pairs):,} pairs; they count as "
-            "not right"
+            f"'{run.info.label}' ended with an error on {errors:,} of {len(run.pairs):,} pairs; they count "
+            "as not right"
         )
     if run.raw_truth:
         found.append(

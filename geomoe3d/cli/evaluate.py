@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -141,7 +142,7 @@ def compare(first: str, second: str) -> None:
     """Compare two runs pair by pair: who is right where, McNemar's test, ratio of the times."""
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.compare import compare as compare_scores
-    from geomoe3d.evaluation.report_text import comparison_text
+    from geomoe3d.evaluation.report_markdown import comparison_text
 
     runs = [_score(Path(folder), raw=False) for folder in (first, second)]
     for folder, found in zip((first, second), runs, strict=True):
@@ -212,9 +213,13 @@ def _score(study: Path, *, raw: bool) -> list[StudiedRun]:
 
 
 def _print_table(runs: list[StudiedRun]) -> None:
-    from geomoe3d.evaluation.report_text import print_table
+    import shutil
 
-    print_table([run.score for run in runs])
+    from geomoe3d.evaluation.report_text import terminal_table
+
+    width = shutil.get_terminal_size((0, 0)).columns or None
+    color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+    click.echo(terminal_table([run.score for run in runs], width=width, color=color))
 
 
 def _command_line() -> str:

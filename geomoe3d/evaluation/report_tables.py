@@ -105,6 +105,9 @@ def scene_tables(members: Sequence[RunScore]) -> str:
             found = [score.scenes.get(scene, {}).get(name) for score in members]
             count = max((measure.count for measure in found if measure is not None), default=0)
             rows.append([escape(scene), f"{count:,}", *(_cell(measure) for measure in found)])
+        whole = [score.measures.get(name) for score in members]
+        count = max((measure.count for measure in whole if measure is not None), default=0)
+        rows.append(["all scenes", f"{count:,}", *(_cell(measure) for measure in whole)])
         heads = ["scene", "pairs", *(escape(score.info.label) for score in members)]
         unit = _unit(score.scenes[scene].get(name) for score in members for scene in score.scenes)
         caption = f"Per scene: {title(name)}{unit}"
@@ -163,7 +166,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> str:
     ]
     rows, notes = [], ""
     for found in comparisons:
-        name = f"{escape(found.a.label)} <small>against</small> {escape(found.b.label)}"
+        name = f'{escape(found.a.label)} <span class="fine">against</span> {escape(found.b.label)}'
         where = escape(group_title((found.a.benchmark, found.a.track)))
         known = found.mcnemar_p is not None
         counts = (

@@ -40,9 +40,9 @@ from geomoe3d.evaluation.report_tables import (
     provenance_of,
     scene_tables,
     swatch,
+    thinning,
 )
-from geomoe3d.evaluation.report_text import _LEGEND as LEGEND
-from geomoe3d.evaluation.report_text import warnings
+from geomoe3d.evaluation.report_text import _LEGEND, warnings
 from geomoe3d.files import write_atomically
 from geomoe3d.visual.page import embed_json
 
@@ -83,8 +83,9 @@ def save_report(
 
 
 def run_key(info: RunInfo) -> str:
-    """What tells a run from every other of a report: label, track and benchmark."""
-    return f"{info.label}.{info.track}.{info.benchmark}"
+    """What tells a run from every other of a report: label, track, benchmark, and the share of its pairs."""
+    every = thinning(info)
+    return f"{info.label}.{info.track}.{info.benchmark}" + (f".every{every}" if every > 1 else "")
 
 
 def render_report(
@@ -121,7 +122,7 @@ def render_report(
         "summary": escape(_summary(groups)),
         "warnings": _warnings(members),
         "main": main_table(groups, runs),
-        "legend": escape(LEGEND[:1].upper() + LEGEND[1:]),
+        "legend": escape(_LEGEND[:1].upper() + _LEGEND[1:]),
         "groups": "".join(
             _section(f"group-{number}", group, scores, runs)
             for number, (group, scores) in enumerate(groups.items())

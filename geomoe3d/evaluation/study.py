@@ -86,14 +86,14 @@ def write_report(path: str | Path, runs: list[StudiedRun], *, force: bool = Fals
     path = Path(path)
     scores, comparisons = [run.score for run in runs], compare_all(runs)
     if path.suffix == ".html":
-        from geomoe3d.evaluation.report_page import save_report
+        from geomoe3d.evaluation.report_page import run_key, save_report
 
         save_report(
             path,
             scores,
             comparisons,
-            pairs={run.folder.name: run.pairs for run in runs},
-            predictions={run.folder.name: run.predictions for run in runs},
+            pairs={run_key(run.score.info): run.pairs for run in runs},
+            predictions={run_key(run.score.info): run.predictions for run in runs},
             force=force,
         )
         return

@@ -1,0 +1,194 @@
+"""Your own method, evaluated by the rules of all others: a Python function of two arrays.
+
+Copy this into ``mine.py`` and evaluate ``mine.py:register`` (or ``package.module:function``)::
+
+    import numpy as np
+
+    def register(source, target, *, seed=0):   # (N, 3) and (N, 3) float64, metres
+        a, b = source - source.mean(0), target - target.mean(0)
+        U, _, Vt = np.linalg.svd(a.T @ b)
+        R = Vt.T @ np.diag([1, 1, np.linalg.det(Vt.T @ U.T)]) @ U.T
+        T = np.eye(4)                          # p_target = R p_source + t
+        T[:3, :3], T[:3, 3] = R, target.mean(0) - R @ source.mean(0)
+        return T                               # or None: no answer
+
+On the correspondence tracks row i of one array belongs to row i of the other; on the track ``clouds`` they
+are the points of two scans, (n, 3) and (m, 3). Keywords named ``seed``, ``voxel_size`` and
+``inlier_threshold`` are filled in where the function takes them. An exception or a result that is no rigid
+motion counts as a pair without an answer and is reported; only the file itself enters the identity of a
+run, not what it imports. Cost: that of the function and one copy of its input.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.evaluation.records import Answer, MethodInput
+from geomoe3d.geometry.se3 import check_motion
+from geomoe3d.types import FloatArray
+
+_KEYWORDS = ("seed", "voxel_size", "inlier_threshold")
+
+
+class AdaptedFunction:
+    """A user's function as a `Method`.
+
+    Args:
+        spec: ``path/to/file.py:function`` or ``package.module:function``.
+
+    Raises:
+        InputError: no such file, module or function, the module fails as it is imported, or the name is not
+            callable.
+    """
+
+    inputs = frozenset({"correspondences", "clouds"})
+
+    def __init__(self, spec: str) -> None:
+        self.name = spec
+        place, _, function = spec.rpartition(":")
+        if not place or not function:
+            raise InputError(f"'{spec}' names no function; write file.py:function or package.module:function")
+        module = _load_file(place) if place.endswith(".py") else _import(place)
+        self._function = _find(module, function, place)
+        self._source_hash = _hash(module)
+        self._keywords = _accepted(self._function)
+
+    def identity(self) -> dict[str, Any]:
+        """The function, the hash of its file, and the version of numpy."""
+        return {
+            "function": self.name.rpartition(":")[2],
+            "source_sha256": self._source_hash,
+            "keywords": list(self._keywords),
+            "versions": {"numpy": np.__version__},
+        }
+
+    def absent(self) -> str | None:
+        """None: a function that cannot be loaded is an error at once."""
+        return None
+
+    def __call__(self, given: MethodInput) -> Answer:
+        """Call the function on copies of the pair's arrays and check what it returns.
+
+        Raises:
+            InputError: the function raised, or returned something that is no rigid motion.
+        """
+        if given.correspondences is not None:
+            source, target = given.correspondences[:, :3].copy(), given.correspondences[:, 3:].copy()
+        elif given.source is not None and given.target is not None:
+            source, target = given.source.copy(), given.target.copy()
+        else:
+            raise InputError(f"{given.pair}: neither correspondences nor clouds were given")
+        keywords = {name: getattr(given, name) for name in self._keywords}
+        try:
+            result = self._function(source, target, **keywords)
+        except GeoMoE3DError as error:
+            raise InputError(f"{given.pair}: '{self.name}': {error}") from error
+        except (Exception, SystemExit) as error:
+            where = _last_line(error)
+            raise InputError(
+                f"{given.pair}: '{self.name}' raised {type(error).__name__}: {error}{where}"
+            ) from error
+        return Answer(_motion(result, f"{given.pair}: '{self.name}'"))
+
+
+def _motion(result: Any, who: str) -> FloatArray | None:
+    """What a function returned as a rigid motion (4, 4); None and non-finite entries mean no answer.
+
+    Raises:
+        InputError: see `geomoe3d.geometry.se3.check_motion`; ``who`` begins the message.
+    """
+    if result is None:
+        return None
+    try:
+        if not np.isfinite(np.asarray(result, dtype=np.float64)).all():
+            return None
+        return check_motion(result)
+    except (TypeError, ValueError, RuntimeError) as error:  # InputError is a ValueError
+        raise InputError(f"{who} returned {_kind(result)}: {error}") from None
+
+
+def _load_file(place: str) -> ModuleType:
+    """The module in a file; its folder joins the search path, so that it finds its neighbours."""
+    path = Path(place).resolve()
+    if not path.is_file():
+        raise InputError(f"no file '{place}' to take a method from")
+    digest = hashlib.sha256(str(path).encode()).hexdigest()[:12]
+    name = f"geomoe3d_method_{path.stem}_{digest}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"'{place}' cannot be imported as Python")
+    module = importlib.util.module_from_spec(spec)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    sys.modules[name] = module  # dataclasses and pickle look their module up
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise InputError(f"'{place}' fails as it is imported: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _import(place: str) -> ModuleType:
+    try:
+        return importlib.import_module(place)
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"module '{place}' cannot be imported: {type(error).__name__}: {error}; for a file of your own "
+            "write its path, e.g. ./mine.py:register"
+        ) from error
+
+
+def _find(module: ModuleType, function: str, place: str) -> Callable[..., Any]:
+    found: Callable[..., Any] | None = getattr(module, function, None)
+    if callable(found):
+        return found
+    if found is not None:
+        raise InputError(f"'{function}' in '{place}' is a {type(found).__name__}, not a function")
+    names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
+    close = difflib.get_close_matches(function, names, n=1, cutoff=0.4)
+    hint = f"did you mean '{close[0]}'?" if close else f"it holds: {', '.join(names) or 'none'}"
+    raise InputError(f"'{place}' holds no function '{function}'; {hint}")
+
+
+def _accepted(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Which of the keywords the function names; none where it has no readable signature."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return ()
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    names = {p.name for k, p in enumerate(parameters) if p.kind in named and k >= 2}
+    return tuple(name for name in _KEYWORDS if name in names)
+
+
+def _hash(module: ModuleType) -> str | None:
+    file = getattr(module, "__file__", None)
+    return None if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+def _kind(result: Any) -> str:
+    shape = getattr(result, "shape", None)
+    return type(result).__name__ + ("" if shape is None else f" of shape {tuple(shape)}")
+
+
+def _last_line(error: BaseException) -> str:
+    """Where the error arose, as `` (file.py, line 12)``."""
+    trace = error.__traceback__
+    if trace is None:
+        return ""
+    while trace.tb_next is not None:
+        trace = trace.tb_next
+    return f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})"

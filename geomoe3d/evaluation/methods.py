@@ -1,0 +1,251 @@
+"""Methods by name: ours on correspondences and clouds, other people's, and a user's own function.
+
+``geomoe3d`` is the whole product with any configuration; ``consensus``, ``spectral`` and ``svd`` are parts
+of it with a fixed one, to compare against. Peers are in `peers`, functions of the user in `adapter`. The
+identity of ours holds the hash of the source that decides answers: a cache never mixes two versions of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib.util
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.config import RegistrationConfig, load_config
+from geomoe3d.errors import ConfigError, InputError
+from geomoe3d.estimators.base import make_estimator
+from geomoe3d.evaluation.adapter import AdaptedFunction
+from geomoe3d.evaluation.peer import versions
+from geomoe3d.evaluation.peers import PEERS
+from geomoe3d.evaluation.records import Answer, Method, MethodInput
+from geomoe3d.filters.base import Filter, FilterOutput, make_filter
+from geomoe3d.geometry.se3 import shift_frames
+from geomoe3d.stages import StageClock
+from geomoe3d.types import BoolArray, Correspondences, FloatArray
+
+if TYPE_CHECKING:
+    from geomoe3d.registration import Registrar
+
+OURS: dict[str, tuple[str, ...]] = {
+    "geomoe3d": (),
+    "consensus": ("filter.name=none", "estimator.name=consensus"),
+    "spectral": ("filter.name=spectral", "estimator.name=svd"),
+    "svd": ("filter.name=none", "estimator.name=svd"),
+}
+"""Our methods and what each sets; all but ``geomoe3d`` take correspondences alone and are fixed."""
+
+_UNDECIDING = frozenset({"evaluation", "cli", "visual", "data", "training"})
+_UNDECIDING_FILES = frozenset(
+    {
+        "__main__.py",
+        "config_text.py",
+        "doctor.py",
+        "files.py",
+        "journal.py",
+        "machine.py",
+        "provenance.py",
+        "transform_files.py",
+        "workers.py",
+    }
+)
+_MATCHING_CHANNELS = frozenset({"feature_distance", "ratio", "mutual"})
+
+
+def method_names() -> list[str]:
+    """Every name that `make_method` knows, ours first; a user's function has no name here."""
+    return [*OURS, *PEERS]
+
+
+def make_method(spec: str, assignments: Sequence[str] = ()) -> Method:
+    """The method of a name, or a user's function.
+
+    Args:
+        spec: one of `method_names`, ``path/to/file.py:function`` or ``package.module:function``.
+        assignments: ``key=value`` of the configuration; only ``geomoe3d`` takes any.
+
+    Raises:
+        InputError: an unknown name (the message gives the nearest one), a function that cannot be loaded, or
+            assignments to a method that takes none.
+        ConfigError: an unknown key or an invalid value.
+        CheckpointError: trained weights are missing, broken or do not fit.
+    """
+    if assignments and spec != "geomoe3d":
+        raise InputError(
+            f"'{assignments[0]}' sets a configuration value, but '{spec}' takes none; only 'geomoe3d' does"
+        )
+    if spec in OURS:
+        return OurMethod(spec, assignments)
+    if spec in PEERS:
+        return PEERS[spec]()
+    if ":" in spec:
+        return AdaptedFunction(spec)
+    close = difflib.get_close_matches(spec.lower(), method_names(), n=1, cutoff=0.4)
+    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(method_names())}."
+    raise InputError(f"unknown method '{spec}'; {hint} A function of your own is written file.py:function")
+
+
+class OurMethod:
+    """The package's own pipeline or a part of it as a `Method`.
+
+    Correspondences go through the configured filter and estimator, with the inlier threshold and voxel size
+    of the input; a threshold that is assigned (``estimator.inlier_threshold``, in voxels) comes before that
+    of the input. Clouds go through `Registrar.explain`, which chooses its own voxel size unless one is
+    assigned. The seed is always that of the input.
+
+    Args:
+        name: one of `OURS`.
+        assignments: ``key=value`` beside what the name sets.
+
+    Raises:
+        ConfigError: an unknown key, an invalid value, or ``seed``.
+        CheckpointError: trained weights are missing, broken or do not fit.
+    """
+
+    def __init__(self, name: str, assignments: Sequence[str] = ()) -> None:
+        self.name = name
+        self.inputs = frozenset({"correspondences", "clouds"} if name == "geomoe3d" else {"correspondences"})
+        keys = {assignment.partition("=")[0].strip() for assignment in assignments}
+        if "seed" in keys:
+            raise ConfigError("'seed' is that of the evaluation for all methods; leave it out of the values")
+        self.config: RegistrationConfig = load_config(None, [*OURS[name], *assignments])
+        self._own_threshold = "estimator.inlier_threshold" in keys
+        self._registrar: Registrar | None = None
+        self._filter: Filter | None = None
+        if self.absent() is None:
+            self._filter = make_filter(self.config.filter.name, self.config.filter.weights)
+            network = getattr(self._filter, "config", None)
+            if _MATCHING_CHANNELS & set(getattr(network, "extra_channels", ())):
+                self.inputs -= {"correspondences"}  # bare coordinates lack what the network was trained with
+        self._estimator = make_estimator(self.config.estimator)
+
+    def identity(self) -> dict[str, Any]:
+        """Configuration, hash of the deciding source, versions of libraries, hash of trained weights."""
+        config = self.config.model_dump(mode="json")
+        config.pop("seed")
+        libraries = ["numpy", "scipy", "open3d-cpu", "open3d", "small_gicp"]
+        if self.config.filter.name == "geomoe":
+            libraries.append("torch")
+        return {
+            "config": config,
+            "own_threshold": self._own_threshold,
+            "source_sha256": source_hash(),
+            "versions": versions(*libraries),
+            "weights_sha256": self._weights_hash(),
+        }
+
+    def absent(self) -> str | None:
+        """Whether the filter's library is missing, and how to install it."""
+        if self.config.filter.name == "geomoe":
+            for module in ("torch", "safetensors"):
+                if importlib.util.find_spec(module) is None:
+                    return f"the filter 'geomoe' needs {module}, which is not installed: pip install {module}"
+        return None
+
+    def __call__(self, given: MethodInput) -> Answer:
+        """Register one pair; see `Method`."""
+        if given.correspondences is not None and "correspondences" in self.inputs:
+            return self._from_correspondences(given.correspondences, given)
+        if given.source is not None and given.target is not None and "clouds" in self.inputs:
+            return self._from_clouds(given.source, given.target, given.seed)
+        raise InputError(f"{given.pair}: '{self.name}' takes {' or '.join(sorted(self.inputs))}")
+
+    def _from_correspondences(self, rows: FloatArray, given: MethodInput) -> Answer:
+        """Filter and estimator on rows (N, 6), each half recentred."""
+        if self._filter is None:
+            raise InputError(f"{given.pair}: {self.absent()}")
+        if len(rows) < 3:
+            return Answer(None)
+        origins = choose_origin(rows[:, :3]), choose_origin(rows[:, 3:])
+        local = np.asarray(rows, dtype=np.float64) - np.concatenate(origins)
+        threshold = given.inlier_threshold
+        if self._own_threshold:
+            threshold = self.config.estimator.inlier_threshold * given.voxel_size
+        clock = StageClock()
+        clock("weigh")
+        weighed = self._filter(Correspondences(local), voxel_size=given.voxel_size, seed=given.seed)
+        clock("solve")
+        found = self._estimator(local, weighed.weights, inlier_threshold=threshold, seed=given.seed)
+        stages = _stages(clock.stop())
+        motions = [shift_frames(hypothesis.T_target_source, *origins) for hypothesis in found]
+        return Answer(
+            motions[0] if motions else None,
+            hypotheses=tuple(motions[1:]),
+            weights=self._weights(weighed),
+            inliers=_declared(weighed),
+            seconds=stages,
+        )
+
+    def _from_clouds(self, source: FloatArray, target: FloatArray, seed: int) -> Answer:
+        """The whole pipeline on points (n, 3) and (m, 3)."""
+        explained = self._registrar_for(seed).explain(source, target)
+        result = explained.result
+        T = result.T_target_source
+        shown = len(explained.correspondences) > 0
+        shift = np.concatenate([explained.source.origin, explained.target.origin])
+        return Answer(
+            T if np.isfinite(T).all() else None,
+            confidence=result.confidence,
+            status=result.status,
+            hypotheses=() if result.alternative is None else (result.alternative.T_target_source,),
+            correspondences=explained.correspondences.points + shift,
+            weights=self._weights(explained.weighed) if shown else None,
+            inliers=_declared(explained.weighed) if shown else None,
+            seconds=_stages(result.seconds),
+        )
+
+    def _registrar_for(self, seed: int) -> Registrar:
+        from geomoe3d.registration import Registrar
+
+        if self._registrar is None or self._registrar.config.seed != seed:
+            self._registrar = Registrar(self.config.model_copy(update={"seed": seed}))
+        return self._registrar
+
+    def _weights(self, weighed: FilterOutput) -> FloatArray | None:
+        """None where nothing was weighed: ones say nothing."""
+        return None if self.config.filter.name == "none" else weighed.weights
+
+    def _weights_hash(self) -> str | None:
+        if self.config.filter.name != "geomoe" or self.absent() is not None:
+            return None
+        from geomoe3d.filters.geomoe_filter import DEFAULT_WEIGHTS
+        from geomoe3d.filters.pretrained import find_weights
+
+        path = find_weights(self.config.filter.weights or DEFAULT_WEIGHTS)
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def source_hash() -> str:
+    """Hash over every source file of the package that can change an answer, hexadecimal.
+
+    Evaluation, command line, pictures, data and training cannot; whatever else is added later counts.
+    """
+    return hash_sources(Path(__file__).resolve().parents[1])
+
+
+def hash_sources(root: Path) -> str:
+    """Hash over names and contents of the deciding ``.py`` files below a package's folder."""
+    total = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        parts = path.relative_to(root).parts
+        if parts[0] in _UNDECIDING or (len(parts) == 1 and parts[0] in _UNDECIDING_FILES):
+            continue
+        total.update("/".join(parts).encode() + b"\0")
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()
+
+
+def _declared(weighed: FilterOutput) -> BoolArray | None:
+    """(N,) the filter's own classification: a positive logit; None for filters without logits."""
+    return None if weighed.logits is None else np.asarray(weighed.logits > 0)
+
+
+def _stages(seconds: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in seconds.items() if name != "total"}

@@ -1,0 +1,119 @@
+"""What all of other people's methods share: recentring, settings, versions, and being absent.
+
+A peer imports its library when it is first called; one that is not installed makes the peer absent, never a
+failure. Clouds and correspondences are recentred first, because some of these libraries compute in single
+precision. Place: below `peers` and `open3d_peers`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.errors import InputError
+from geomoe3d.evaluation.records import Answer, MethodInput
+from geomoe3d.geometry.se3 import make_transform, project_to_so3, shift_frames
+from geomoe3d.types import FloatArray
+
+INSTALL = "pip install 'geomoe3d[peers]'"
+CORRESPONDENCES = frozenset({"correspondences"})
+CLOUDS = frozenset({"clouds"})
+LEAST_MATCHED = 10
+"""Points in contact below which a local method has found nothing."""
+
+_NO_SETTINGS = ("name", "inputs", "module", "distributions")
+
+
+@dataclass(kw_only=True)
+class Peer:
+    """What all peers share; further fields of a subclass are its settings.
+
+    Attributes:
+        name: as on the command line.
+        inputs: as in `Method`.
+        module: what is imported.
+        distributions: whose versions decide the answers; those that are not installed are left out.
+        common_origin: True for local methods: both clouds are shifted alike, so that the start stays the
+            identity of the files' own coordinates.
+        limits: where the library can be installed, if not everywhere.
+    """
+
+    name: str
+    inputs: frozenset[str]
+    module: str
+    distributions: tuple[str, ...]
+    common_origin: ClassVar[bool] = False
+    limits: ClassVar[str] = ""
+
+    def identity(self) -> dict[str, Any]:
+        """Settings, versions of the libraries, and the hash of the files that define the peer."""
+        return {
+            "settings": {key: value for key, value in asdict(self).items() if key not in _NO_SETTINGS},
+            "versions": versions("numpy", *self.distributions),
+            "source_sha256": _source_hash(type(self)),
+        }
+
+    def absent(self) -> str | None:
+        """Which library is missing, and how to install it; None where the peer can run."""
+        if importlib.util.find_spec(self.module) is not None:
+            return None
+        limits = f" ({self.limits})" if self.limits else ""
+        return f"'{self.name}' needs {self.distributions[0]}, which is not installed: {INSTALL}{limits}"
+
+    def __call__(self, given: MethodInput) -> Answer:
+        """Register one pair; see `Method`.
+
+        Raises:
+            InputError: the pair comes without the input that this peer takes, or the library refuses it.
+        """
+        if given.correspondences is not None and "correspondences" in self.inputs:
+            source, target = given.correspondences[:, :3], given.correspondences[:, 3:]
+        elif given.source is not None and given.target is not None and "clouds" in self.inputs:
+            source, target = given.source, given.target
+        else:
+            raise InputError(f"{given.pair}: '{self.name}' takes {' or '.join(sorted(self.inputs))}")
+        if min(len(source), len(target)) < 3:
+            return Answer(None)
+        far = choose_origin(target)
+        origins = (far if self.common_origin else choose_origin(source)), far
+        try:
+            answer = self.register(source - origins[0], target - origins[1], given)
+        except RuntimeError as error:  # how the libraries' own C++ complains of one pair
+            raise InputError(f"{given.pair}: '{self.name}': {error}") from error
+        T = answer.T_target_source
+        if T is None or not np.isfinite(T).all():
+            return Answer(None, inliers=answer.inliers, seconds=answer.seconds)
+        T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
+        return Answer(shift_frames(T, *origins), inliers=answer.inliers, seconds=answer.seconds)
+
+    def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
+        """The peer itself on recentred points (N, 3); thresholds, voxel size and seed are in ``given``."""
+        raise NotImplementedError
+
+
+def versions(*distributions: str) -> dict[str, str]:
+    """Versions of those distributions that are installed."""
+    found = {}
+    for name in distributions:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _source_hash(peer: type[Peer]) -> str:
+    """Over the files of the class and its bases in this package."""
+    files = {inspect.getsourcefile(kind) for kind in peer.__mro__ if issubclass(kind, Peer)}
+    total = hashlib.sha256()
+    for file in sorted(file for file in files if file is not None):
+        total.update(Path(file).read_bytes())
+    return total.hexdigest()

@@ -1,0 +1,172 @@
+"""Other people's methods by name, run by the rules of ours: same input, same clock, good settings.
+
+What they share is in `peer`, those of Open3D are in `open3d_peers`, the others are here. Settings were chosen
+on the 3DMatch pairs of four scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from geomoe3d.evaluation.open3d_peers import (
+    IdentityIcp,
+    Open3DFastGlobal,
+    Open3DFeatureRansac,
+    Open3DRansac,
+)
+from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, LEAST_MATCHED, Peer
+from geomoe3d.evaluation.records import Answer, MethodInput
+from geomoe3d.geometry.se3 import make_transform, shift_frames
+from geomoe3d.types import FloatArray
+
+_SMALL_CLOUD = 3000
+
+
+@dataclass(kw_only=True)
+class SmallGicp(Peer):
+    """small_gicp's GICP from the identity, one thread.
+
+    Attributes:
+        distance: largest distance of matched points, in voxels.
+        iterations: most steps.
+    """
+
+    name: str = "small-gicp"
+    module: str = "small_gicp"
+    distributions: tuple[str, ...] = ("small_gicp",)
+    inputs: frozenset[str] = CLOUDS
+    common_origin: ClassVar[bool] = True
+    distance: float = 10.0
+    iterations: int = 100
+
+    def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
+        """See `Peer.register`. Its ``converged`` is true even where nothing matched, so matches count."""
+        import small_gicp
+
+        answer = small_gicp.align(
+            target,
+            source,
+            registration_type="GICP",
+            downsampling_resolution=given.voxel_size,
+            max_correspondence_distance=self.distance * given.voxel_size,
+            num_threads=1,
+            max_iterations=self.iterations,
+        )
+        found = answer.num_inliers >= LEAST_MATCHED
+        return Answer(np.array(answer.T_target_source) if found else None)
+
+
+@dataclass(kw_only=True)
+class KissMatcher(Peer):
+    """KISS-Matcher end to end at the benchmark's voxel size, otherwise with its defaults.
+
+    It has no seed and works in threads: answers differ a little from run to run. Making the matcher costs
+    microseconds, so each pair gets a fresh one.
+    """
+
+    name: str = "kiss-matcher"
+    module: str = "kiss_matcher"
+    distributions: tuple[str, ...] = ("kiss-matcher",)
+    inputs: frozenset[str] = CLOUDS
+
+    def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
+        """See `Peer.register`. Its ``valid`` decides whether there is an answer."""
+        if not all(_has_surface(points, 3 * given.voxel_size) for points in (source, target)):
+            return Answer(None)
+        import kiss_matcher
+
+        matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(given.voxel_size))
+        answer = matcher.estimate(source, target)
+        if not answer.valid:
+            return Answer(None)
+        T = make_transform(np.array(answer.rotation), np.array(answer.translation).ravel())
+        stages = {
+            "prepare": matcher.get_processing_time(),
+            "describe": matcher.get_extraction_time(),
+            "match": matcher.get_matching_time(),
+            "solve": matcher.get_rejection_time() + matcher.get_solver_time(),
+        }
+        return Answer(T, seconds=stages)
+
+
+@dataclass(kw_only=True)
+class GraphCutRansac(Peer):
+    """Graph-Cut RANSAC (``pygcransac``) on correspondences. It has no seed: answers differ from run to run.
+
+    Attributes:
+        iterations: most samples.
+        least_iterations: fewest samples.
+        confidence: stops when this sure.
+        spatial_coherence: weight of the neighbourhood in the local optimisation.
+        neighborhood_size: as the library counts it.
+        early_rejection: whether the sequential probability ratio test drops bad models early.
+        early_rejection_ratio: the inlier ratio that the test starts from.
+    """
+
+    name: str = "gc-ransac"
+    limits: ClassVar[str] = "there are wheels for Linux and Python up to 3.11"
+    module: str = "pygcransac"
+    distributions: tuple[str, ...] = ("pygcransac",)
+    inputs: frozenset[str] = CORRESPONDENCES
+    iterations: int = 100_000
+    least_iterations: int = 1000
+    confidence: float = 0.999
+    spatial_coherence: float = 0.0
+    neighborhood_size: float = 4.0
+    early_rejection: bool = True
+    early_rejection_ratio: float = 0.1
+
+    def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
+        """See `Peer.register`. The library's motion is for rows, p' = p T, hence the transpose."""
+        import pygcransac
+
+        rows = np.hstack([source, target])
+        low = rows.min(axis=0)  # its grid wants coordinates that are not negative
+        T, _ = pygcransac.findRigidTransform(
+            np.ascontiguousarray(rows - low),
+            np.ones(len(rows)),
+            threshold=given.inlier_threshold,
+            conf=self.confidence,
+            spatial_coherence_weight=self.spatial_coherence,
+            max_iters=self.iterations,
+            min_iters=self.least_iterations,
+            use_sprt=self.early_rejection,
+            min_inlier_ratio_for_sprt=self.early_rejection_ratio,
+            sampler=0,
+            neighborhood=0,
+            neighborhood_size=self.neighborhood_size,
+            use_space_partitioning=False,
+        )
+        if T is None:
+            return Answer(None)
+        return Answer(shift_frames(np.array(T).T, low[:3], low[3:]))
+
+
+PEERS: dict[str, Callable[[], Peer]] = {
+    "open3d-ransac-50k": Open3DRansac,
+    "open3d-ransac-1m": lambda: Open3DRansac(name="open3d-ransac-1m", iterations=1_000_000),
+    "open3d-feature-ransac": Open3DFeatureRansac,
+    "open3d-fgr": Open3DFastGlobal,
+    "icp-identity": IdentityIcp,
+    "small-gicp": SmallGicp,
+    "kiss-matcher": KissMatcher,
+    "gc-ransac": GraphCutRansac,
+}
+"""Peers by the name of the command line."""
+
+
+def _has_surface(points: FloatArray, radius: float) -> bool:
+    """Whether enough points have neighbours to fit normals to: KISS-Matcher crashes without any.
+
+    Large clouds are not looked at: this is on the peer's clock, and only sparse ones are at fault.
+    """
+    if len(points) >= _SMALL_CLOUD:
+        return True
+    from scipy.spatial import KDTree
+
+    neighbors = KDTree(points).query_ball_point(points, radius, return_length=True)
+    return int((np.asarray(neighbors) > 10).sum()) >= 50

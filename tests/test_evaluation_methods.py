@@ -1,0 +1,443 @@
+"""Methods by name: ours and a user's function on pairs with a known motion; identities and refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import geomoe3d
+from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.errors import CheckpointError, ConfigError, GeoMoE3DError, InputError
+from geomoe3d.evaluation import methods
+from geomoe3d.evaluation.methods import OURS, hash_sources, make_method, method_names
+from geomoe3d.evaluation.records import MethodInput
+from geomoe3d.geometry.se3 import (
+    make_transform,
+    rotation_error_deg,
+    transform_points,
+    translation_error,
+)
+
+MOTION = make_transform(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([1.5, -0.5, 2.0]))
+UTM = np.array([583394.0, 5283100.0, 498.0])
+HORN = """
+import numpy as np
+
+def register(source, target):
+    a, b = source - source.mean(0), target - target.mean(0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R = Vt.T @ np.diag([1, 1, np.linalg.det(Vt.T @ U.T)]) @ U.T
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, target.mean(0) - R @ source.mean(0)
+    source += 1e6   # a careless function must not spoil what the next method is given
+    return T
+
+MOTION = 7
+"""
+
+
+def correspondences(share: float = 0.6, seed: int = 0, count: int = 300) -> np.ndarray:
+    """Rows (count, 6) in a room, a share of which agree with MOTION up to 1 cm."""
+    rng = np.random.default_rng(seed)
+    source = rng.uniform(-2, 2, (count, 3))
+    target = transform_points(MOTION, source) + rng.normal(0, 0.01, (count, 3))
+    wrong = rng.permutation(count)[: round((1 - share) * count)]
+    target[wrong] = rng.uniform(-3, 3, (len(wrong), 3)) + MOTION[:3, 3]
+    return np.hstack([source, target])
+
+
+def pair_of(rows: np.ndarray, seed: int = 0) -> MethodInput:
+    return MethodInput("room/0-1", correspondences=rows, seed=seed)
+
+
+def lands(
+    T: np.ndarray | None, truth: np.ndarray = MOTION, degrees: float = 1.0, metres: float = 0.05
+) -> bool:
+    return T is not None and (rotation_error_deg(T, truth) < degrees and translation_error(T, truth) < metres)
+
+
+@pytest.fixture(scope="module")
+def room():
+    source, target, T = make_sample_pair(seed=0)
+    return source.file_points, target.file_points, T
+
+
+def write(folder: Path, text: str, name: str = "mine.py") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# ---- ours on correspondences ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["geomoe3d", "consensus"])
+def test_ours_land_among_wrong_correspondences(name):
+    answer = make_method(name)(pair_of(correspondences(0.3)))
+    assert lands(answer.T_target_source)
+    assert set(answer.seconds) == {"weigh", "solve"}
+    assert answer.status is None
+    assert answer.weights is None
+    assert answer.inliers is None
+    assert all(not np.array_equal(T, answer.T_target_source) for T in answer.hypotheses)
+
+
+def test_spectral_matching_weighs_and_lands():
+    rows = correspondences(0.6)
+    answer = make_method("spectral")(pair_of(rows))
+    assert lands(answer.T_target_source, degrees=3, metres=0.15)
+    right = np.linalg.norm(transform_points(MOTION, rows[:, :3]) - rows[:, 3:], axis=1) < 0.1
+    assert answer.weights is not None
+    assert answer.weights[right].mean() > 5 * answer.weights[~right].mean()
+
+
+def test_plain_svd_is_least_squares_of_all_rows():
+    assert lands(make_method("svd")(pair_of(correspondences(1.0))).T_target_source)
+    assert not lands(make_method("svd")(pair_of(correspondences(0.6))).T_target_source)
+
+
+def test_map_coordinates_do_not_matter():
+    rows = correspondences(0.5)
+    near = make_method("geomoe3d")(pair_of(rows))
+    far = make_method("geomoe3d")(pair_of(rows + np.tile(UTM, 2)))
+    assert near.T_target_source is not None
+    assert far.T_target_source is not None
+    moved = transform_points(far.T_target_source, rows[:, :3] + UTM) - UTM
+    assert np.abs(moved - transform_points(near.T_target_source, rows[:, :3])).max() < 1e-3
+
+
+def test_same_seed_same_answer():
+    rows = correspondences(0.2, count=800)
+    for assignments in ((), ("estimator.name=ransac",)):
+        one, two = (make_method("geomoe3d", assignments)(pair_of(rows, seed=3)) for _ in range(2))
+        assert one.T_target_source is not None
+        assert one.T_target_source.tobytes() == two.T_target_source.tobytes()
+
+
+def test_seed_of_the_input_reaches_the_estimator():
+    rows = correspondences(0.1, count=800)
+    method = make_method("geomoe3d", ["estimator.name=ransac", "estimator.ransac_iterations=300"])
+    answers = [method(pair_of(rows, seed=seed)).T_target_source for seed in range(6)]
+    assert len({None if T is None else T.tobytes() for T in answers}) > 1
+
+
+@pytest.mark.parametrize("name", list(OURS))
+def test_no_motion_is_no_answer(name):
+    on_a_line = np.outer(np.arange(20.0), [1, 0, 0, 0, 1, 0])
+    for rows in (np.zeros((0, 6)), correspondences(1.0, count=2), on_a_line):
+        answer = make_method(name)(pair_of(rows))
+        assert answer.T_target_source is None
+        assert answer.hypotheses == ()
+
+
+def test_threshold_of_the_input_unless_assigned():
+    rows = correspondences(1.0)
+    rows[::2, 3] += 0.25  # inliers only of a wide threshold; they pull a fit towards them
+    close = make_method("geomoe3d")(pair_of(rows)).T_target_source
+    wide = make_method("geomoe3d", ["estimator.inlier_threshold=12"])(pair_of(rows)).T_target_source
+    assert translation_error(close, MOTION) < 0.02 or abs(translation_error(close, MOTION) - 0.25) < 0.02
+    assert 0.04 < translation_error(wide, MOTION) < 0.21
+
+
+def test_missing_input_is_named():
+    with pytest.raises(InputError, match=r"room/0-1: 'svd' takes correspondences"):
+        make_method("svd")(MethodInput("room/0-1", source=np.zeros((5, 3)), target=np.zeros((5, 3))))
+
+
+# ---- ours on clouds ---------------------------------------------------------------------------------
+
+
+def test_clouds_give_what_a_report_needs_in_file_coordinates(room):
+    source, target, T = room
+    shift = np.array([3e5, -2e5, 1e3])
+    given = MethodInput("room/0-1", source=source + shift, target=target)
+    answer = make_method("geomoe3d")(given)
+    assert answer.T_target_source is not None
+    truth = T.copy()
+    truth[:3, 3] -= T[:3, :3] @ shift
+    assert rotation_error_deg(answer.T_target_source, truth) < 0.5
+    centre = (source + shift).mean(0)[None]
+    assert (
+        np.abs(transform_points(answer.T_target_source, centre) - transform_points(truth, centre)).max()
+        < 0.02
+    )
+    assert answer.status == "ok"
+    assert answer.confidence is not None
+    assert answer.confidence > 0.9
+    assert "verify" in answer.seconds
+    assert "total" not in answer.seconds
+    rows = answer.correspondences
+    assert rows is not None
+    assert answer.inliers is None
+    extent = np.abs(rows[:, :3] - centre).max()
+    assert extent < 10  # near the given source, not near zero
+    near = np.linalg.norm(transform_points(answer.T_target_source, rows[:, :3]) - rows[:, 3:], axis=1) < 0.1
+    assert near.sum() > 20
+
+
+def test_hopeless_clouds_have_no_motion():
+    rng = np.random.default_rng(0)
+    given = MethodInput("a/0-1", source=rng.uniform(size=(500, 3)), target=1000 * rng.uniform(size=(500, 3)))
+    answer = make_method("geomoe3d")(given)
+    assert answer.T_target_source is None
+    assert answer.status == "failed"
+    assert len(answer.correspondences) == 0
+    with pytest.raises(GeoMoE3DError):
+        make_method("geomoe3d")(MethodInput("a/0-1", source=np.zeros((1, 3)), target=np.zeros((1, 3))))
+
+
+# ---- the network ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch = pytest.importorskip("torch")
+    from geomoe3d.filters.architecture import NetworkConfig
+    from geomoe3d.filters.geomoe import GeoMoE
+    from geomoe3d.filters.pretrained import WeightCard, save_pretrained
+
+    made = {}
+    for name, channels in (("plain", ()), ("other", ()), ("matching", ("ratio",))):
+        torch.manual_seed(len(made))
+        config = NetworkConfig(num_layers=2, width=16, num_sub_fields=8, extra_channels=channels)
+        made[name] = tmp_path_factory.mktemp("weights") / f"{name}.safetensors"
+        save_pretrained(made[name], GeoMoE(config), WeightCard(architecture={}))
+    return made
+
+
+def network(path: Path) -> list[str]:
+    return ["filter.name=geomoe", f"filter.weights={path}"]
+
+
+def test_network_classifies_by_its_logits(weights):
+    rows = correspondences(0.6)
+    answer = make_method("geomoe3d", network(weights["plain"]))(pair_of(rows))
+    assert answer.inliers is not None
+    assert answer.weights is not None
+    assert answer.inliers.dtype == np.bool_
+    assert answer.inliers.shape == answer.weights.shape == (len(rows),)
+    assert np.array_equal(answer.inliers, answer.weights > 0)
+
+
+def test_identity_changes_with_the_weights(weights):
+    one = make_method("geomoe3d", network(weights["plain"])).identity()
+    two = make_method("geomoe3d", network(weights["other"])).identity()
+    assert one["weights_sha256"] != two["weights_sha256"]
+    assert len(one["weights_sha256"]) == 64
+    assert "torch" in one["versions"]
+
+
+def test_network_of_matching_channels_takes_no_bare_correspondences(weights):
+    assert make_method("geomoe3d", network(weights["matching"])).inputs == {"clouds"}
+    assert make_method("geomoe3d", network(weights["plain"])).inputs == {"clouds", "correspondences"}
+
+
+def test_missing_weights_are_refused_before_any_pair():
+    with pytest.raises(CheckpointError, match="nowhere"):
+        make_method("geomoe3d", network(Path("nowhere.safetensors")))
+
+
+def test_network_without_torch_is_absent(weights, monkeypatch):
+    find = methods.importlib.util.find_spec
+    monkeypatch.setattr(
+        methods.importlib.util,
+        "find_spec",
+        lambda name, *rest: None if name == "torch" else find(name, *rest),
+    )
+    method = make_method("geomoe3d", network(weights["plain"]))
+    assert "pip install torch" in method.absent()
+    assert method.identity()["weights_sha256"] is None
+    assert make_method("geomoe3d").absent() is None
+
+
+# ---- names and identities ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("geomoe", "geomoe3d"), ("open3d-ransac-50K", "open3d-ransac-50k"), ("kissmatcher", "kiss-matcher")],
+)
+def test_unknown_names_get_the_nearest(name, hint):
+    with pytest.raises(InputError, match=f"did you mean '{hint}'"):
+        make_method(name)
+
+
+def test_far_off_names_get_the_whole_list():
+    with pytest.raises(InputError, match=r"consensus.*gc-ransac.*file.py:function"):
+        make_method("zzz")
+
+
+def test_every_name_makes_a_method_with_a_plain_identity():
+    assert len(set(method_names())) == len(method_names())
+    for name in method_names():
+        method = make_method(name)
+        assert method.name == name
+        assert method.inputs <= {"correspondences", "clouds"}
+        assert method.inputs
+        identity = method.identity()
+        assert json.loads(json.dumps(identity)) == identity
+        assert identity["versions"]["numpy"] == np.__version__
+
+
+def test_identities_differ_where_answers_may():
+    seen = [json.dumps(make_method(name).identity(), sort_keys=True) for name in method_names()]
+    assert len(set(seen)) == len(seen) - 1  # geomoe3d without further settings is consensus
+    plain = make_method("geomoe3d").identity()
+    assert make_method("geomoe3d", ["matching.neighbors=2"]).identity() != plain
+    assert make_method("geomoe3d", ["estimator.inlier_threshold=2"]).identity() != plain
+    assert make_method("geomoe3d").identity() == plain
+
+
+def test_assignments_are_for_geomoe3d_alone():
+    for name in ("consensus", "open3d-fgr", "mine.py:register"):
+        with pytest.raises(InputError, match="only 'geomoe3d'"):
+            make_method(name, ["voxel_size=0.1"])
+    with pytest.raises(ConfigError, match=r"matching\.neighbors"):
+        make_method("geomoe3d", ["matching.neighbours=2"])
+    with pytest.raises(ConfigError, match="seed"):
+        make_method("geomoe3d", ["seed=2"])
+
+
+def test_source_hash_follows_what_decides_and_nothing_else(tmp_path):
+    package = Path(geomoe3d.__file__).parent
+    copy = tmp_path / "geomoe3d"
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.pyi"))
+    before = hash_sources(copy)
+    assert before == hash_sources(copy)
+    for name in ("evaluation/methods.py", "cli/main.py", "visual/page.py", "data/draw.py", "doctor.py"):
+        with (copy / name).open("a", encoding="utf-8") as stream:
+            stream.write("\n")
+    assert hash_sources(copy) == before
+    for name in (
+        "geometry/rigid_fit.py",
+        "clouds/formats/ply.py",
+        "filters/folded.py",
+        "estimators/consensus.py",
+        "judge.py",
+        "registration.py",
+        "verification.py",
+    ):
+        with (copy / name).open("a", encoding="utf-8") as stream:
+            stream.write("\n")
+        after = hash_sources(copy)
+        assert after != before
+        before = after
+    write(copy, "", "a_new_stage.py")
+    assert hash_sources(copy) != before
+
+
+# ---- a user's function ------------------------------------------------------------------------------
+
+
+def test_function_of_a_file_lands_and_cannot_spoil_its_input(tmp_path):
+    method = make_method(f"{write(tmp_path, HORN)}:register")
+    rows = correspondences(1.0)
+    kept = rows.copy()
+    assert lands(method(pair_of(rows)).T_target_source)
+    assert np.array_equal(rows, kept)
+    assert method.absent() is None
+    assert method.inputs == {"clouds", "correspondences"}
+
+
+def test_example_of_the_documentation_runs(tmp_path):
+    from geomoe3d.evaluation import adapter
+
+    lines = adapter.__doc__.split("::\n", 1)[1].split("\nOn the", 1)[0]
+    path = write(tmp_path, "\n".join(line[4:] for line in lines.splitlines()))
+    assert lands(make_method(f"{path}:register")(pair_of(correspondences(1.0))).T_target_source)
+
+
+def test_function_on_clouds_gets_two_sizes(tmp_path):
+    path = write(tmp_path, "def sizes(a, b):\n    raise ValueError(f'{a.shape} {b.shape}')\n")
+    given = MethodInput("x/0-1", source=np.zeros((5, 3)), target=np.ones((7, 3)))
+    with pytest.raises(GeoMoE3DError, match=r"x/0-1.*ValueError: \(5, 3\) \(7, 3\) \(mine.py, line 2\)"):
+        make_method(f"{path}:sizes")(given)
+
+
+def test_function_gets_the_keywords_it_names(tmp_path):
+    text = (
+        "def f(a, b, *, seed, inlier_threshold, other=1):\n"
+        "    raise RuntimeError(f'{seed} {inlier_threshold} {other}')\n"
+    )
+    with pytest.raises(InputError, match=r"RuntimeError: 9 0\.1 1"):
+        make_method(f"{write(tmp_path, text)}:f")(pair_of(correspondences(), seed=9))
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("return np.eye(3)", r"ndarray of shape \(3, 3\)"),
+        ("return 'right'", "returned str"),
+        ("return (np.eye(3), np.zeros(3))", "returned tuple"),
+        ("return 2 * np.eye(4)", "no rigid motion|last row"),
+        ("return np.diag([1.1, 1.1, 1.1, 1])", "no rigid motion"),
+        ("return np.diag([1, 1, -1, 1])", "mirrors"),
+        ("return np.diag([1, 1, 1, 2])", "last row"),
+        ("return 1 / 0", "ZeroDivisionError"),
+        ("import sys; sys.exit(3)", "SystemExit"),
+    ],
+)
+def test_nonsense_is_an_error_of_its_pair(tmp_path, body, message):
+    path = write(tmp_path, f"import numpy as np\ndef f(a, b):\n    {body}\n")
+    with pytest.raises(GeoMoE3DError, match=message) as caught:
+        make_method(f"{path}:f")(pair_of(correspondences()))
+    assert "room/0-1" in str(caught.value)
+
+
+@pytest.mark.parametrize("value", ["None", "np.full((4, 4), np.nan)", "np.full((4, 4), np.inf)"])
+def test_functions_may_give_up(tmp_path, value):
+    path = write(tmp_path, f"import numpy as np\ndef f(a, b):\n    return {value}\n")
+    assert make_method(f"{path}:f")(pair_of(correspondences())).T_target_source is None
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("registr", "did you mean 'register'"),
+        ("MOTION", "not a function"),
+        ("", "names no function"),
+    ],
+)
+def test_functions_that_are_not_there(tmp_path, function, message):
+    with pytest.raises(InputError, match=message):
+        make_method(f"{write(tmp_path, HORN)}:{function}")
+
+
+def test_files_and_modules_that_are_not_there(tmp_path):
+    with pytest.raises(InputError, match="no file"):
+        make_method(f"{tmp_path}/none.py:f")
+    with pytest.raises(InputError, match="no_such_package"):
+        make_method("no_such_package.module:f")
+    broken = write(tmp_path, "import a_library_that_is_not_there\n", "broken.py")
+    with pytest.raises(InputError, match="a_library_that_is_not_there"):
+        make_method(f"{broken}:f")
+    assert lands(
+        make_method(f"{write(tmp_path, HORN)}:register")(pair_of(correspondences(1.0))).T_target_source
+    )
+
+
+def test_function_of_a_package(tmp_path, monkeypatch):
+    write(tmp_path, HORN, "some_package_of_mine.py")
+    monkeypatch.syspath_prepend(tmp_path)
+    method = make_method("some_package_of_mine:register")
+    assert lands(method(pair_of(correspondences(1.0))).T_target_source)
+    assert len(method.identity()["source_sha256"]) == 64
+
+
+def test_a_file_finds_its_neighbours(tmp_path):
+    write(tmp_path, "VALUE = None\n", "neighbour_of_a_method.py")
+    text = "def f(a, b):\n    import neighbour_of_a_method\n    return neighbour_of_a_method.VALUE\n"
+    assert make_method(f"{write(tmp_path, text)}:f")(pair_of(correspondences())).T_target_source is None
+
+
+def test_identity_of_a_function_follows_its_file(tmp_path):
+    spec = f"{write(tmp_path, HORN)}:register"
+    first = make_method(spec).identity()
+    assert make_method(spec).identity() == first
+    write(tmp_path, HORN + "\n")
+    assert make_method(spec).identity() != first

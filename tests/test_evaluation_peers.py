@@ -1,0 +1,210 @@
+"""Other people's methods: each lands where it can, says when it cannot, and is never called when absent."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.errors import InputError
+from geomoe3d.evaluation import peer as base
+from geomoe3d.evaluation.open3d_peers import Open3DFeatureRansac, Open3DRansac
+from geomoe3d.evaluation.peers import PEERS
+from geomoe3d.evaluation.records import MethodInput
+from geomoe3d.geometry.se3 import (
+    make_transform,
+    rotation_error_deg,
+    transform_points,
+    translation_error,
+)
+
+MOTION = make_transform(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([1.5, -0.5, 2.0]))
+UTM = np.array([583394.0, 5283100.0, 498.0])
+ON_CORRESPONDENCES = [name for name, make in PEERS.items() if "correspondences" in make().inputs]
+ON_CLOUDS = [name for name, make in PEERS.items() if "clouds" in make().inputs]
+LOCAL = ["icp-identity", "small-gicp"]
+UNSEEDED = ["kiss-matcher", "gc-ransac"]
+
+
+def present(name: str):
+    peer = PEERS[name]()
+    reason = peer.absent()
+    if reason is not None:
+        pytest.skip(reason)
+    return peer
+
+
+def correspondences(share: float, seed: int = 0, count: int = 400) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    source = rng.uniform(-2, 2, (count, 3))
+    target = transform_points(MOTION, source) + rng.normal(0, 0.01, (count, 3))
+    wrong = rng.permutation(count)[: round((1 - share) * count)]
+    target[wrong] = rng.uniform(-3, 3, (len(wrong), 3)) + MOTION[:3, 3]
+    return np.hstack([source, target])
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Two views thinned to 2 cm: KISS-Matcher looks at every point."""
+    source, target, T = make_sample_pair(seed=0)
+    rng = np.random.default_rng(0)
+    points = [cloud.file_points for cloud in (source, target)]
+    return *(p[rng.permutation(len(p))[:40_000]] for p in points), T
+
+
+def clouds(source: np.ndarray, target: np.ndarray) -> MethodInput:
+    return MethodInput("room/0-1", source=source, target=target)
+
+
+@pytest.mark.parametrize("name", ON_CORRESPONDENCES)
+def test_lands_on_correspondences(name):
+    peer = present(name)
+    rows = correspondences(0.6)
+    answer = peer(MethodInput("room/0-1", correspondences=rows))
+    assert answer.T_target_source is not None
+    assert rotation_error_deg(answer.T_target_source, MOTION) < 1.5
+    assert translation_error(answer.T_target_source, MOTION) < 0.08
+    assert np.abs(answer.T_target_source[:3, :3].T @ answer.T_target_source[:3, :3] - np.eye(3)).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", ON_CORRESPONDENCES)
+def test_map_coordinates_do_not_matter(name):
+    peer = present(name)
+    rows = correspondences(0.6)
+    answer = peer(MethodInput("room/0-1", correspondences=rows + np.tile(UTM, 2)))
+    moved = transform_points(answer.T_target_source, rows[:, :3] + UTM) - UTM
+    assert np.abs(moved - transform_points(MOTION, rows[:, :3])).max() < 0.15
+
+
+def test_ransac_says_which_are_inliers():
+    rows = correspondences(0.5)
+    answer = Open3DRansac()(MethodInput("room/0-1", correspondences=rows))
+    residuals = np.linalg.norm(transform_points(answer.T_target_source, rows[:, :3]) - rows[:, 3:], axis=1)
+    assert answer.inliers is not None
+    assert (residuals[answer.inliers] < 0.12).all()  # its set is that of the motion before the last fit
+    assert (residuals[~answer.inliers] > 0.08).all()
+    assert 200 <= answer.inliers.sum() < 215
+
+
+@pytest.mark.parametrize("name", ["open3d-feature-ransac", "kiss-matcher"])
+def test_lands_on_clouds(name, room):
+    peer = present(name)
+    source, target, T = room
+    answer = peer(clouds(source, target))
+    assert answer.T_target_source is not None
+    assert rotation_error_deg(answer.T_target_source, T) < 15  # the benchmark's rule: no refinement follows
+    assert translation_error(answer.T_target_source, T) < 0.30
+    assert all(seconds >= 0 for seconds in answer.seconds.values())
+    assert answer.seconds["describe"] > 0
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_local_methods_land_from_close_by_only(name, room):
+    peer = present(name)
+    source, _, _ = room
+    nudge = make_transform(
+        Rotation.from_rotvec([0.03, 0.02, -0.04]).as_matrix(), np.array([0.05, -0.03, 0.04])
+    )
+    halves = source[::2] + UTM, transform_points(nudge, source[1::2]) + UTM
+    found = peer(clouds(*halves)).T_target_source
+    moved = transform_points(found, source + UTM) - UTM
+    assert np.linalg.norm(moved - transform_points(nudge, source), axis=1).max() < 0.03
+    wide = make_transform(Rotation.from_rotvec([0, 0, 2.5]).as_matrix(), np.array([0.5, 0, 0]))
+    lost = peer(clouds(source[::2], transform_points(wide, source[1::2]))).T_target_source
+    assert lost is None or rotation_error_deg(lost, wide) > 15
+
+
+@pytest.mark.parametrize("name", ON_CORRESPONDENCES)
+def test_hopeless_correspondences_never_give_the_identity(name):
+    peer = present(name)
+    rng = np.random.default_rng(1)
+    hopeless = [
+        np.hstack([rng.uniform(-1, 1, (3, 3)), 100 * rng.uniform(-1, 1, (3, 3))]),
+        rng.uniform(-1, 1, (2, 6)),
+        np.zeros((0, 6)),
+    ]
+    if name.startswith("open3d-ransac"):
+        hopeless.append(np.hstack([rng.uniform(-1, 1, (50, 3)), 100 * rng.uniform(-1, 1, (50, 3))]))
+    for rows in hopeless:
+        T = peer(MethodInput("a/0-1", correspondences=rows)).T_target_source
+        assert T is None or not np.allclose(T, np.eye(4))
+
+
+@pytest.mark.parametrize("name", ON_CLOUDS)
+def test_hopeless_clouds_never_give_the_identity(name):
+    """KISS-Matcher would crash on some of these, others answer with the identity."""
+    peer = present(name)
+    rng = np.random.default_rng(1)
+    for source, target in (
+        (rng.uniform(size=(50, 3)), 1000 + 20 * rng.uniform(size=(60, 3))),
+        (rng.uniform(size=(3, 3)), rng.uniform(size=(3, 3)) + 30),
+        (np.zeros((0, 3)), np.zeros((5, 3))),
+    ):
+        assert peer(clouds(source, target)).T_target_source is None
+
+
+@pytest.mark.parametrize("name", sorted(set(ON_CORRESPONDENCES) - set(UNSEEDED)))
+def test_same_seed_same_answer(name):
+    peer, rows = present(name), correspondences(0.3)
+    one, two = (
+        peer(MethodInput("a/0-1", correspondences=rows, seed=4)).T_target_source.tobytes() for _ in range(2)
+    )
+    assert one == two
+
+
+def test_feature_ransac_is_seeded(room):
+    source, target, _ = room
+    peer = Open3DFeatureRansac(iterations=500)
+    one, two = (peer(clouds(source, target)).T_target_source.tobytes() for _ in range(2))
+    assert one == two
+
+
+@pytest.mark.parametrize("name", list(PEERS))
+def test_absent_library_is_reported_not_called(name, monkeypatch):
+    peer = PEERS[name]()
+    find = base.importlib.util.find_spec
+    monkeypatch.setattr(
+        base.importlib.util,
+        "find_spec",
+        lambda wanted, *rest: None if wanted == peer.module else find(wanted),
+    )
+    monkeypatch.setitem(sys.modules, peer.module, None)  # an import would raise
+    reason = peer.absent()
+    assert reason is not None
+    assert "pip install 'geomoe3d[peers]'" in reason
+    assert name in reason
+    assert peer.identity()["settings"] == PEERS[name]().identity()["settings"]
+
+
+@pytest.mark.parametrize("name", list(PEERS))
+def test_wrong_track_is_an_error(name):
+    peer = PEERS[name]()
+    rows, points = np.zeros((10, 6)), np.zeros((10, 3))
+    given = {
+        "correspondences": MethodInput("a/0-1", source=points, target=points),
+        "clouds": MethodInput("a/0-1", correspondences=rows),
+    }
+    for kind in ("correspondences", "clouds"):
+        if peer.inputs == {kind}:
+            with pytest.raises(InputError, match=f"a/0-1: '{name}' takes {kind}"):
+                peer(given[kind])
+
+
+def test_a_librarys_complaint_is_an_error_of_the_pair(monkeypatch):
+    def complain(*_):
+        raise RuntimeError("[Open3D Error] no")
+
+    monkeypatch.setattr(Open3DRansac, "register", complain)
+    with pytest.raises(InputError, match=r"a/0-1: 'open3d-ransac-50k': \[Open3D Error\] no"):
+        Open3DRansac()(MethodInput("a/0-1", correspondences=correspondences(1.0)))
+
+
+def test_identity_follows_the_settings():
+    assert Open3DRansac(iterations=7).identity() != Open3DRansac().identity()
+    settings = [
+        PEERS[f"open3d-ransac-{size}"]().identity()["settings"]["iterations"] for size in ("50k", "1m")
+    ]
+    assert settings == [50_000, 1_000_000]

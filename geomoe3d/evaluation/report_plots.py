@@ -2,7 +2,7 @@
 
 Colours are classes of the page's style sheet, so that light and dark mode both work; every series carries
 the number of its run, so that the page can switch it off. Place: between `records` and `report_page`. Cost:
-a millisecond per figure and 10 to 40 kB; curves over all pairs are thinned to 160 points.
+a millisecond per figure and 10 to 40 kB; curves over all pairs are thinned to 200 points.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from geomoe3d.evaluation.records import Measure, RunScore
 
 NUM_COLORS = 8
 """Run colours of the style sheet; further runs repeat them with broken lines."""
-MAX_CURVE_POINTS = 160
+NUM_STAGE_COLORS = 16
+MAX_CURVE_POINTS = 200
 
 _WIDTH, _HEIGHT = 440.0, 290.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 12.0, 10.0, 40.0
@@ -178,11 +179,12 @@ def error_figure(
         finite = np.sort(known[np.isfinite(known)])
         shares = 100.0 * np.arange(1, len(finite) + 1) / known.size
         keep = np.unique(np.linspace(0, len(finite) - 1, min(len(finite), MAX_CURVE_POINTS)).astype(int))
-        points = [(float(finite[k]), float(shares[k])) for k in keep] if len(finite) else []
-        points = [
-            (x.low, 100.0 * float(np.mean(known <= x.low))),
-            *(p for p in points if x.low < p[0] <= x.high),
-        ]
+        reached = 100.0 * float(np.mean(known <= x.low))
+        points = [(x.low, reached)]
+        for k in keep:
+            if x.low < finite[k] <= x.high:  # a step: level up to the error, then up
+                points += [(float(finite[k]), reached), (float(finite[k]), float(shares[k]))]
+                reached = float(shares[k])
         points.append((x.high, 100.0 * float(np.mean(known <= x.high))))
         series.append(Series(run, score.info.label, points))
     if not series:
@@ -294,7 +296,7 @@ def time_figure(runs: Sequence[tuple[int, RunScore]]) -> str:
         if whole > mean:  # stages measured inside the method may overlap or be rounded up
             parts = {name: value * mean / whole for name, value in parts.items()}
         for name in parts:
-            stages.setdefault(name, len(stages) % NUM_COLORS)
+            stages.setdefault(name, len(stages) % NUM_STAGE_COLORS)
         rows.append((run, score, mean, float(np.median(seconds)), parts))
     if not rows:
         return ""

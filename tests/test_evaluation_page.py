@@ -30,9 +30,10 @@ from geomoe3d.evaluation.records import (
     RunInfo,
     RunScore,
 )
+from geomoe3d.evaluation.report_chart import Axis, Series, chart
 from geomoe3d.evaluation.report_gallery import choose_run, make_card, worst_failures
 from geomoe3d.evaluation.report_page import render_report, run_key, save_report
-from geomoe3d.evaluation.report_plots import Axis, Series, chart, figures, is_unrelated
+from geomoe3d.evaluation.report_plots import figures, is_unrelated
 from geomoe3d.evaluation.report_text import _interval, _value, main_row
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points

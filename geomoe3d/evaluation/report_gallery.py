@@ -8,7 +8,6 @@ clouds from disk. Cost: about 0.3 s and 50 kB per failure.
 from __future__ import annotations
 
 import base64
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from geomoe3d.data.collection import load_fragment
 from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.evaluation.measures import has_motion
 from geomoe3d.evaluation.records import EvaluationPair, PairScore, Prediction, RunScore
+from geomoe3d.evaluation.report_chart import escape
 from geomoe3d.evaluation.report_plots import is_unrelated
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.types import FloatArray
@@ -161,11 +161,11 @@ def _text(number: int, failure: PairScore, clouds: dict[str, Any] | None, proble
     ]
     if failure.error:
         facts.append(("error", failure.error))
-    rows = "".join(f"<div><dt>{name}</dt><dd>{_escape(value)}</dd></div>" for name, value in facts)
-    name = _escape(failure.pair)
+    rows = "".join(f"<div><dt>{name}</dt><dd>{escape(value)}</dd></div>" for name, value in facts)
+    name = escape(failure.pair)
     head = f'<article class="card" id="card-{number}"><h4>{name}</h4>'
     if clouds is None:
-        return f'{head}<p class="lacking">{_escape(problem)}</p><dl>{rows}</dl></article>'
+        return f'{head}<p class="lacking">{escape(problem)}</p><dl>{rows}</dl></article>'
     choices = ""
     words = {"estimate": "as estimated", "truth": "true motion"}
     for k, motion in enumerate(clouds["motions"]):
@@ -196,7 +196,3 @@ def _number(value: float | None, form: str, unit: str = "") -> str:
 
 def _or(value: float | None, other: float) -> float:
     return other if value is None or math.isnan(value) else value
-
-
-def _escape(text: str) -> str:
-    return html.escape(text, quote=True)

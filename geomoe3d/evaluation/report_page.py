@@ -21,6 +21,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunInfo, RunScore
+from geomoe3d.evaluation.report_chart import escape
 from geomoe3d.evaluation.report_gallery import (
     MAX_POINTS,
     MAX_TOTAL_POINTS,
@@ -33,7 +34,6 @@ from geomoe3d.evaluation.report_tables import (
     Group,
     calibration_table,
     comparison_table,
-    escape,
     group_title,
     main_table,
     measure_table,

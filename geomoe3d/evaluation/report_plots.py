@@ -1,95 +1,22 @@
-"""The plots of the HTML report: small inline SVG, drawn here rather than by a library, one call per figure.
+"""Which figures the HTML report shows of the runs on one benchmark and track, all runs in each.
 
-Colours are classes of the page's style sheet, so that light and dark mode both work; every series carries
-the number of its run, so that the page can switch it off. Place: between `records` and `report_page`. Cost:
-a millisecond per figure and 10 to 40 kB; curves over all pairs are thinned to 200 points.
+Place: between `report_chart`, which draws, and `report_page`. Cost: a few milliseconds; curves over all pairs
+are thinned to 200 points.
 """
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from geomoe3d.evaluation.measures import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
 from geomoe3d.evaluation.records import Measure, RunScore
+from geomoe3d.evaluation.report_chart import Axis, Series, chart, escape
 
-NUM_COLORS = 8
-"""Run colours of the style sheet; further runs repeat them with broken lines."""
 NUM_STAGE_COLORS = 16
 MAX_CURVE_POINTS = 200
-
-_WIDTH, _HEIGHT = 440.0, 290.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 12.0, 10.0, 40.0
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One axis of a figure.
-
-    Attributes:
-        label: what and unit.
-        low: value at its beginning, more than 0 for ``log``.
-        high: value at its end, more than ``low``.
-        log: True for decades.
-        names: (value, text) of the ticks; empty for round numbers.
-    """
-
-    label: str
-    low: float
-    high: float
-    log: bool = False
-    names: tuple[tuple[float, str], ...] = ()
-
-    def share(self, value: float) -> float:
-        """Where a value lies, 0 at the beginning to 1 at the end; values outside lie on the nearer end."""
-        low, high = self.low, self.high
-        value = min(max(value, low), high)
-        if self.log:
-            return math.log(value / low) / math.log(high / low)
-        return (value - low) / (high - low)
-
-    def ticks(self) -> list[tuple[float, str]]:
-        """Values on the axis with their texts."""
-        return list(self.names) or [(value, f"{value:g}") for value in self._round_values()]
-
-    def _round_values(self) -> list[float]:
-        """At most about eight."""
-        if self.log:
-            first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
-            steps = (1.0, 2.0, 5.0) if math.log10(self.high / self.low) < 2.5 else (1.0,)
-            found = [s * 10.0**k for k in range(first, last + 1) for s in steps]
-        else:
-            step = 10.0 ** math.floor(math.log10((self.high - self.low) / 3.0))
-            step *= max(f for f in (1.0, 2.0, 5.0) if f * step <= (self.high - self.low) / 3.0)
-            first = math.ceil(self.low / step - 1e-9)
-            found = [k * step for k in range(first, math.floor(self.high / step + 1e-9) + 1)]
-        slack = 1e-9 * (self.high - self.low)
-        return [value for value in found if self.low - slack <= value <= self.high + slack]
-
-
-@dataclass(frozen=True)
-class Series:
-    """One run in one figure.
-
-    Attributes:
-        run: number of the run's label, decides colour and dashes.
-        name: the label.
-        points: (x, y); a NaN breaks the line.
-        band: (low, high) per point, NaN where there is none; empty for no band.
-        tips: one text per point, shown on hover; empty for a line without marks.
-        sizes: radius of each mark in pixels; empty takes 3.
-    """
-
-    run: int
-    name: str
-    points: Sequence[tuple[float, float]]
-    band: Sequence[tuple[float, float]] = ()
-    tips: Sequence[str] = ()
-    sizes: Sequence[float] = ()
 
 
 def figures(scores: Sequence[RunScore], runs: Sequence[int]) -> list[str]:
@@ -306,7 +233,7 @@ def time_figure(runs: Sequence[tuple[int, RunScore]]) -> str:
         rest = max(0.0, mean - sum(parts.values()))
         pieces = "".join(
             f'<i class="s{stages[name]}" style="width:{100 * value / longest:.2f}%" '
-            f'title="{_escape(name)}: {_duration(value)}"></i>'
+            f'title="{escape(name)}: {_duration(value)}"></i>'
             for name, value in parts.items()
         )
         pieces += (
@@ -314,11 +241,11 @@ def time_figure(runs: Sequence[tuple[int, RunScore]]) -> str:
             f'title="not told apart: {_duration(rest)}"></i>'
         )
         text += (
-            f'<div class="bar run r{run}"><span>{_escape(score.info.label)}</span>'
+            f'<div class="bar run r{run}"><span>{escape(score.info.label)}</span>'
             f'<span class="track">{pieces}<b style="left:{100 * median / longest:.2f}%"></b></span>'
             f"<span>{_duration(median)}<small>mean {_duration(mean)}</small></span></div>"
         )
-    key = "".join(f'<li><i class="s{k}"></i>{_escape(name)}</li>' for name, k in stages.items())
+    key = "".join(f'<li><i class="s{k}"></i>{escape(name)}</li>' for name, k in stages.items())
     key += '<li><i class="rest"></i>not told apart</li><li><i class="tick"></i>median</li>'
     return (
         f'<figure class="wide"><figcaption>Time per pair</figcaption><div class="bars">{text}</div>'
@@ -327,134 +254,9 @@ def time_figure(runs: Sequence[tuple[int, RunScore]]) -> str:
     )
 
 
-def chart(
-    title: str,
-    x: Axis,
-    y: Axis,
-    series: Sequence[Series],
-    *,
-    marks: Sequence[tuple[float, str]] = (),
-    diagonal: bool = False,
-    note: str = "",
-) -> str:
-    """Lines over two axes as a figure element.
-
-    Args:
-        title: caption.
-        x: horizontal axis.
-        y: vertical axis.
-        series: drawn in this order, bands below all lines.
-        marks: vertical lines (x value, text).
-        diagonal: True adds the dotted line from corner to corner.
-        note: one sentence below.
-    """
-    parts = [_grid(x, y)]
-    if diagonal:
-        parts.append(_line([(x.low, y.low), (x.high, y.high)], x, y, "ideal"))
-    for value, text in marks:
-        at = _across(x, value)
-        parts.append(f'<path class="mark" d="M{at:.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>')
-        parts.append(f'<text x="{at - 4:.1f}" y="{_TOP + 11}" text-anchor="end">{_escape(text)}</text>')
-    parts += [_band(one, x, y) for one in series if one.band]
-    for one in series:
-        parts.append(f'<g class="{run_classes(one.run)}">')
-        parts += [_line(stretch, x, y, "line") for stretch in _stretches(one.points)]
-        parts += [_dot(one, k, x, y) for k in range(len(one.tips))]
-        parts.append("</g>")
-    names = ", ".join(one.name for one in series)
-    below = f"<p>{_escape(note)}</p>" if note else ""
-    words = _escape(f"{title}: {y.label} against {x.label}, for {names}")
-    return (
-        f"<figure><figcaption>{_escape(title)}</figcaption>"
-        f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img" aria-label="{words}">{"".join(parts)}</svg>'
-        f"{below}</figure>"
-    )
-
-
-def run_classes(run: int) -> str:
-    """Classes of the style sheet for a run: to switch it, its colour, its dashes."""
-    return f"run r{run} c{run % NUM_COLORS} d{min(run // NUM_COLORS, 3)}"
-
-
 def is_unrelated(score: RunScore) -> bool:
     """Whether the pairs of a run have no true motion; False for a run without pairs."""
     return bool(score.pairs) and all(pair.rotation_error_deg is None for pair in score.pairs)
-
-
-def _grid(x: Axis, y: Axis) -> str:
-    right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
-    parts = []
-    for value, text in x.ticks():
-        at = _across(x, value)
-        parts.append(f'<path d="M{at:.1f} {_TOP}V{bottom}"/>')
-        parts.append(f'<text x="{at:.1f}" y="{bottom + 15}" text-anchor="middle">{text}</text>')
-    for value, text in y.ticks():
-        at = _down(y, value)
-        parts.append(f'<path d="M{_LEFT} {at:.1f}H{right}"/>')
-        parts.append(f'<text x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{text}</text>')
-    middle = (_TOP + bottom) / 2
-    parts.append(
-        f'<text x="{(_LEFT + right) / 2}" y="{_HEIGHT - 6}" text-anchor="middle">{_escape(x.label)}</text>'
-        f'<text transform="translate(12 {middle}) rotate(-90)" text-anchor="middle">{_escape(y.label)}</text>'
-    )
-    return f'<g class="grid">{"".join(parts)}</g>'
-
-
-def _band(one: Series, x: Axis, y: Axis) -> str:
-    rows = [
-        (px, *limits) if math.isfinite(py) and all(map(math.isfinite, limits)) else (px, math.nan, math.nan)
-        for (px, py), limits in zip(one.points, one.band, strict=True)
-    ]
-    text = ""
-    for stretch in _stretches([(px, low + high) for px, low, high in rows]):
-        inside = [row for row in rows if any(row[0] == px for px, _ in stretch)]
-        if len(inside) == 1:  # a bin between two empty ones: a bar instead of an area
-            px, low, high = inside[0]
-            text += (
-                f'<path class="whisker" d="M{_across(x, px):.1f} {_down(y, low):.1f}V{_down(y, high):.1f}"/>'
-            )
-            continue
-        outline = [(px, high) for px, _, high in inside] + [(px, low) for px, low, _ in reversed(inside)]
-        text += f'<path class="band" d="M{_path(outline, x, y)}Z"/>'
-    return f'<g class="{run_classes(one.run)}">{text}</g>'
-
-
-def _line(points: Sequence[tuple[float, float]], x: Axis, y: Axis, kind: str) -> str:
-    return f'<path class="{kind}" d="M{_path(points, x, y)}"/>'
-
-
-def _dot(one: Series, k: int, x: Axis, y: Axis) -> str:
-    px, py = one.points[k]
-    if not (math.isfinite(px) and math.isfinite(py)):
-        return ""
-    radius = one.sizes[k] if one.sizes else 3.0
-    return (
-        f'<circle cx="{_across(x, px):.1f}" cy="{_down(y, py):.1f}" r="{radius:.1f}">'
-        f"<title>{_escape(one.tips[k])}</title></circle>"
-    )
-
-
-def _path(points: Iterable[tuple[float, float]], x: Axis, y: Axis) -> str:
-    return "L".join(f"{_across(x, px):.1f} {_down(y, py):.1f}" for px, py in points)
-
-
-def _stretches(points: Sequence[tuple[float, float]]) -> list[list[tuple[float, float]]]:
-    """The points between NaNs."""
-    found: list[list[tuple[float, float]]] = [[]]
-    for point in points:
-        if math.isfinite(point[0]) and math.isfinite(point[1]):
-            found[-1].append(point)
-        elif found[-1]:
-            found.append([])
-    return [stretch for stretch in found if stretch]
-
-
-def _across(x: Axis, value: float) -> float:
-    return _LEFT + x.share(value) * (_WIDTH - _LEFT - _RIGHT)
-
-
-def _down(y: Axis, value: float) -> float:
-    return _HEIGHT - _BOTTOM - y.share(value) * (_HEIGHT - _TOP - _BOTTOM)
 
 
 def _measure_words(measure: Measure) -> str:
@@ -472,7 +274,3 @@ def _duration(seconds: float) -> str:
 def _round_up(value: float) -> float:
     step = 10.0 ** math.floor(math.log10(value))
     return next(f * step for f in (1.0, 2.0, 5.0, 10.0) if f * step >= value * (1 - 1e-9))
-
-
-def _escape(text: str) -> str:
-    return html.escape(text, quote=True)

@@ -6,13 +6,12 @@ and `report_page`.
 
 from __future__ import annotations
 
-import html
 import json
 from collections.abc import Iterable, Mapping, Sequence
 
 from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
-from geomoe3d.evaluation.report_plots import run_classes
+from geomoe3d.evaluation.report_chart import escape, run_classes
 from geomoe3d.evaluation.report_text import _HEADINGS, _finite, _interval, _pairs, _provenance, _value
 from geomoe3d.evaluation.summary import title
 
@@ -32,11 +31,6 @@ MAIN_MEASURES = (
     "time_median",
 )
 """Columns of the main table, one for each of the headings."""
-
-
-def escape(text: str) -> str:
-    """Text for the inside of an element or of an attribute in double quotes."""
-    return html.escape(text, quote=True)
 
 
 def group_title(group: Group) -> str:

@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.evaluation import report_gallery, report_tables
+from geomoe3d.evaluation import report_gallery
 from geomoe3d.evaluation.compare import compare
 from geomoe3d.evaluation.records import (
     EvaluationPair,
@@ -34,7 +34,7 @@ from geomoe3d.evaluation.report_chart import Axis, Series, chart
 from geomoe3d.evaluation.report_gallery import choose_run, make_card, worst_failures
 from geomoe3d.evaluation.report_page import render_report, run_key, save_report
 from geomoe3d.evaluation.report_plots import figures, is_unrelated
-from geomoe3d.evaluation.report_text import _interval, _value, main_row
+from geomoe3d.evaluation.report_words import MAIN_MEASURES, interval_text, main_row, value_text
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 
@@ -214,15 +214,15 @@ def test_page_is_well_formed_and_complete(two_runs):
         for cell in main_row(score):
             assert cell in document.words
         for measure in score.measures.values():
-            assert _value(measure) in document.words
+            assert value_text(measure) in document.words
             for text in (
-                _interval(measure),
-                _interval(measure, over_scenes=True),
+                interval_text(measure),
+                interval_text(measure, over_scenes=True),
             ):
                 assert text in document.words
         for scene, measures in score.scenes.items():
             assert scene in document.words
-            assert all(_value(measure) in document.words for measure in measures.values())
+            assert all(value_text(measure) in document.words for measure in measures.values())
         for word in (
             score.info.commit,
             score.info.hardware,
@@ -235,12 +235,12 @@ def test_page_is_well_formed_and_complete(two_runs):
     assert "seed 7" in document.words
     assert "2026-05-06 07:08 UTC" in document.words
     assert f"{comparisons[0].mcnemar_p:.3g}" in document.words
-    assert _value(comparisons[0].recall_difference) in document.words
+    assert value_text(comparisons[0].recall_difference) in document.words
 
 
 def test_columns_are_those_of_the_text_reports(two_runs):
     for score, _, _ in two_runs:
-        own = [_value(m) for m in map(score.measures.get, report_tables.MAIN_MEASURES)]
+        own = [value_text(m) for m in map(score.measures.get, MAIN_MEASURES)]
         assert own == main_row(score)
 
 
@@ -252,8 +252,8 @@ def test_main_table_row_by_row(two_runs):
         values = [re.sub("<small>.*", "", cell) for cell in re.findall("<td>(.*?)</td>", cells)]
         assert values == main_row(score)
         intervals = re.findall("<td>.*?(?:<small>(.*?)</small>)?</td>", cells)
-        measures = map(score.measures.get, report_tables.MAIN_MEASURES)
-        assert intervals == [_interval(measure) for measure in measures]
+        measures = map(score.measures.get, MAIN_MEASURES)
+        assert intervals == [interval_text(measure) for measure in measures]
 
 
 def test_page_asks_nothing_of_the_network(two_runs):
@@ -328,7 +328,7 @@ def test_a_share_of_the_benchmark_is_told(pairs):
     assert run_key(whole.info) == "same.1k.3DMatch"
     assert run_key(share.info) == "same.1k.3DMatch.every15"
     words = Document(report((whole, pairs, predictions), (share, pairs, predictions))).words
-    assert words.count("12 pairs, 1 in 15 of the benchmark") == 1
+    assert words.count("12 pairs, 1 in 15 of the benchmark") == 2  # in the main table and beside the command
 
 
 def test_bad_arguments(two_runs, tmp_path):

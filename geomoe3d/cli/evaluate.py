@@ -215,7 +215,7 @@ def _score(study: Path, *, raw: bool) -> list[StudiedRun]:
 def _print_table(runs: list[StudiedRun]) -> None:
     import shutil
 
-    from geomoe3d.evaluation.report_text import terminal_table
+    from geomoe3d.evaluation.report_terminal import terminal_table
 
     width = shutil.get_terminal_size((0, 0)).columns or None
     color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")

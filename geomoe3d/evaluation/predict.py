@@ -7,6 +7,7 @@ one thing only: to label the correspondences that a method weighed, after it has
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -188,6 +189,10 @@ def _info(
 
 
 def _threads(workers: int) -> int:
+    """Threads of each worker; a single one works in this process, with what its environment allows."""
+    if workers == 1:
+        limit = os.environ.get("OMP_NUM_THREADS", "")
+        return min(int(limit), usable_cores()) if limit.isdecimal() and int(limit) > 0 else usable_cores()
     return max(1, usable_cores() // workers)
 
 

@@ -40,9 +40,8 @@ from geomoe3d.evaluation.report_tables import (
     provenance_of,
     scene_tables,
     swatch,
-    thinning,
 )
-from geomoe3d.evaluation.report_text import _LEGEND, warnings
+from geomoe3d.evaluation.report_words import LEGEND, thinning, warnings
 from geomoe3d.files import write_atomically
 from geomoe3d.visual.page import embed_json
 
@@ -122,7 +121,7 @@ def render_report(
         "summary": escape(_summary(groups)),
         "warnings": _warnings(members),
         "main": main_table(groups, runs),
-        "legend": escape(_LEGEND[:1].upper() + _LEGEND[1:]),
+        "legend": escape(LEGEND[:1].upper() + LEGEND[1:]),
         "groups": "".join(
             _section(f"group-{number}", group, scores, runs)
             for number, (group, scores) in enumerate(groups.items())

@@ -1,6 +1,6 @@
-"""The tables of the HTML report; words and rounding are those of `report_text`, so that no two forms differ.
+"""The tables of the HTML report; words and rounding are those of `report_words`, so that no two forms differ.
 
-Everything that a user can influence (labels, scenes, commands) is escaped here. Place: between `report_text`
+Everything that a user can influence (labels, scenes, commands) is escaped here. Place: between `report_words`
 and `report_page`.
 """
 
@@ -10,45 +10,26 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 
 from geomoe3d.evaluation.compare import Comparison
-from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
+from geomoe3d.evaluation.records import Measure, RunScore
 from geomoe3d.evaluation.report_chart import escape, run_classes
-from geomoe3d.evaluation.report_text import _HEADINGS, _finite, _interval, _pairs, _provenance, _value
+from geomoe3d.evaluation.report_words import (
+    HEADINGS,
+    MAIN_MEASURES,
+    finite,
+    interval_text,
+    pairs_text,
+    provenance,
+    value_text,
+)
 from geomoe3d.evaluation.summary import title
 
 Group = tuple[str, str]
 """Benchmark and track."""
 
-MAIN_MEASURES = (
-    "recall_15",
-    "recall_20",
-    "recall_15_scene_mean",
-    "rmse_recall",
-    "rotation_median",
-    "translation_median",
-    "verified_f1",
-    "accepted",
-    "accepted_right",
-    "time_median",
-)
-"""Columns of the main table, one for each of the headings."""
-
 
 def group_title(group: Group) -> str:
     """Benchmark and track in words."""
     return f"{group[0]}, track {group[1]}"
-
-
-def pairs_text(score: RunScore) -> str:
-    """How many pairs the run is over, and whether these are a share of the benchmark only."""
-    every = thinning(score.info)
-    return _pairs(score) + (f", 1 in {every} of the benchmark" if every > 1 else "")
-
-
-def thinning(info: RunInfo) -> int:
-    """n where a run was made on every n-th pair of its benchmark, else 1."""
-    given = info.identity.get("pairs")
-    every = given.get("every") if isinstance(given, dict) else None
-    return every if isinstance(every, int) else 1
 
 
 def swatch(run: int) -> str:
@@ -65,7 +46,7 @@ def main_table(groups: Mapping[Group, Sequence[RunScore]], runs: Mapping[str, in
     """
     head = "".join(
         f'<th scope="col" title="{escape(title(name))}">{escape(heading).replace(chr(10), "<br>")}</th>'
-        for name, heading in zip(MAIN_MEASURES, _HEADINGS, strict=True)
+        for name, heading in zip(MAIN_MEASURES, HEADINGS, strict=True)
     )
     body = ""
     for group, members in groups.items():
@@ -182,12 +163,12 @@ def comparison_table(comparisons: Sequence[Comparison]) -> str:
 
 def provenance_of(score: RunScore) -> str:
     """Where the numbers of a run come from: commit, hardware, seed, command, and its whole identity."""
-    rows = [("method", score.info.method), *_provenance(score)]
+    rows = [("method", score.info.method), *provenance(score)]
     text = ""
     for name, value in rows:
         shown = f"<code>{escape(value)}</code>" if name == "command" else escape(value)
         text += f"<div><dt>{name}</dt><dd>{shown}</dd></div>"
-    identity = json.dumps(_finite(score.info.identity), indent=1, sort_keys=True)
+    identity = json.dumps(finite(score.info.identity), indent=1, sort_keys=True)
     return (
         f"<article><h3>{escape(score.info.label)}</h3><dl>{text}</dl>"
         "<details><summary>Everything that decides its predictions</summary>"
@@ -199,10 +180,10 @@ def _cell(measure: Measure | None, *, full: bool = False, signed: bool = False) 
     """Value and interval over pairs; in full also the one over scenes and the count."""
     if measure is None:
         return "-"
-    value = _value(measure)
+    value = value_text(measure)
     if signed and measure.value > 0:
         value = f"+{value}"
-    over_pairs, over_scenes = _interval(measure), _interval(measure, over_scenes=True)
+    over_pairs, over_scenes = interval_text(measure), interval_text(measure, over_scenes=True)
     text = value + (f"<small>{over_pairs}</small>" if over_pairs else "")
     if full:
         text += f"<small>scenes {over_scenes}</small>" if over_scenes else ""

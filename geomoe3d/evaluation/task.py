@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, load_pairs, thin_out
+from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, UNRELATED, load_pairs, thin_out
 from geomoe3d.evaluation.records import EvaluationPair, RunInfo
 
 
@@ -33,8 +33,9 @@ class Task:
     seed: int = 0
 
     def pairs(self) -> list[EvaluationPair]:
-        """The pairs, in the benchmark's order."""
-        return thin_out(load_pairs(self.benchmark, self.root, num_unrelated=self.num_unrelated), self.every)
+        """The pairs, in the benchmark's order; the number of unrelated ones is not thinned."""
+        pairs = load_pairs(self.benchmark, self.root, num_unrelated=self.num_unrelated)
+        return pairs if self.benchmark == UNRELATED else thin_out(pairs, self.every)
 
 
 def load_run_pairs(info: RunInfo) -> list[EvaluationPair]:

@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from geomoe3d.batch.run import register_pairs
     from geomoe3d.clouds.io import load_points, save_points
     from geomoe3d.config import RegistrationConfig, load_config
     from geomoe3d.errors import (
@@ -53,12 +54,14 @@ __all__ = [
     "load_config",
     "load_points",
     "register",
+    "register_pairs",
     "save_points",
 ]
 
 _HOME = {
     "Registrar": "registration",
     "register": "registration",
+    "register_pairs": "batch.run",
     "RegistrationResult": "result",
     "RegistrationConfig": "config",
     "load_config": "config",

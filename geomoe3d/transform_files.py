@@ -94,3 +94,34 @@ def check_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> str
         found = f"suffix '{suffix}'" if suffix else "no suffix"
         raise FormatError(f"cannot write '{path}': {found}; use one of {', '.join(suffixes)}")
     return suffix
+
+
+def load_transform(path: str | os.PathLike[str]) -> FloatArray:
+    """The motion (4, 4) of a file that `save_transform` or `save_result` wrote, or of four rows of text.
+
+    Raises:
+        InputError: the file cannot be read, or holds a result without a transform.
+        FormatError: an unknown suffix, or not 4 x 4 numbers.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in TRANSFORM_SUFFIXES:
+        raise FormatError(
+            f"'{path}' has no suffix of a transform; use one of {', '.join(TRANSFORM_SUFFIXES)}"
+        )
+    try:
+        if suffix == ".json":
+            T = RegistrationResult.from_json(path.read_text(encoding="utf-8")).T_target_source
+        elif suffix == ".npy":
+            T = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        else:
+            T = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except OSError as error:
+        raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
+    except (ValueError, EOFError) as error:
+        raise FormatError(f"'{path}' holds no transform: {error}") from None
+    if T.shape != (4, 4):
+        raise FormatError(f"'{path}' holds numbers of shape {T.shape}, expected (4, 4)")
+    if not np.isfinite(T).all():
+        raise InputError(f"'{path}' holds no transform, its numbers are not finite")
+    return T

@@ -85,11 +85,14 @@ class Verifier:
         random_targets = rng.permutation(len(target))[:_NUM_RANDOM]
         self._threshold = inlier_threshold
         self._points, self._normals = source.points[chosen], source.normals[chosen]
-        self._features = source.features[chosen]
+        # Products of float32 differ in their last bits with the number of threads; those of float64, rounded,
+        # do not, and a random target that is the nearest one is then as similar as itself, not more.
+        self._features = source.features[chosen].astype(np.float64)
         self._target = target
         self._target_features = target.features
         self._tree = cKDTree(target.points)
-        self._random_similarity = self._features @ target.features[random_targets].T
+        random_features = target.features[random_targets].astype(np.float64)
+        self._random_similarity = (self._features @ random_features.T).astype(np.float32)
         self._back = target.points[np.sort(rng.permutation(len(target))[:num_queries])]
         self._source_view = self._target_view = None
         if source.viewpoint is not None and target.viewpoint is not None:
@@ -107,7 +110,10 @@ class Verifier:
         cosine = np.einsum("ij,ij->i", normals, self._target.normals[nearest])
         # Without both sensor positions the normals' signs are a guess, and only their lines can be compared.
         agrees = (cosine if self._target_view is not None else np.abs(cosine)) > _LEAST_COSINE
-        similarity = np.einsum("ij,ij->i", self._features[hit], self._target_features[nearest])
+        products = np.einsum(
+            "ij,ij->i", self._features[hit], self._target_features[nearest].astype(np.float64)
+        )
+        similarity = products.astype(np.float32)
         more_similar = (self._random_similarity[hit] > similarity[:, None]).sum(1)
         p_value = (1 + more_similar) / (1 + self._random_similarity.shape[1])
         closeness = 1 - (distance[hit] / self._threshold) ** 2

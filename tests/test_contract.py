@@ -272,7 +272,7 @@ ORDER = [
     {"filters", "estimators", "data"},
     {"verification", "refine", "judge", "plausibility", "answer", "stages"},
     {"registration"},
-    {"evaluation", "training", "visual"},
+    {"evaluation", "training", "visual", "batch", "multiway"},
     {"cli", "__main__"},
 ]
 """Each may import from its own level and those above it in this list."""

@@ -36,6 +36,18 @@ _ABANDONED_SECONDS = 3600.0
 _COUNTS = ("num_input", "num_non_finite", "num_duplicates", "num_isolated")
 
 
+CACHE_VARIABLE = "GEOMOE3D_CACHE"
+
+
+def default_cache_folder() -> Path:
+    """The user's own: ``GEOMOE3D_CACHE``, else ``geomoe3d`` in the system's folder for caches."""
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "geomoe3d" / "described"
+
+
 class DescriptionCache:
     """A folder of described clouds, bounded in size; what was used longest ago goes first.
 

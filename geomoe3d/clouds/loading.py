@@ -136,7 +136,8 @@ def read_raw(data: Any) -> RawCloud:
     except FileNotFoundError as error:
         if error.filename is not None and Path(error.filename) != path:
             raise FormatError(f"'{path}' refers to a missing file '{error.filename}'") from None
-        raise InputError(f"there is no file '{path}'; check the path (folder now: {Path.cwd()})") from None
+        here = "" if path.is_absolute() else f" (folder now: {Path.cwd()})"
+        raise InputError(f"there is no file '{path}'; check the path{here}") from None
     except PermissionError:
         raise InputError(f"'{path}' may not be read: permission denied; check its owner and mode") from None
     except OSError as error:

@@ -1,0 +1,72 @@
+"""How much memory a worker takes, said before the work begins, and how many workers that allows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from geomoe3d.batch.table import PairRow
+from geomoe3d.errors import InputError
+from geomoe3d.machine import Machine
+from geomoe3d.provenance import usable_cores
+
+_BASE_BYTES = 450 * 2**20  # libraries, one block of the similarity matrix, and described clouds
+_PER_FILE_BYTE = 5  # binary PLY of single floats: 12 bytes a point in the file, some 60 while it is thinned
+_PER_COMPRESSED_BYTE = 40
+_COMPRESSED = {".laz", ".npz", ".e57", ".glb"}
+_KEPT_FREE = 0.1
+
+
+def worker_bytes(rows: Iterable[PairRow]) -> int:
+    """An estimate of the memory that the largest pair takes; missing files count nothing."""
+    largest = 0.0
+    sizes: dict[str, float] = {}
+    for row in rows:
+        for path in (row.source, row.target):
+            if path not in sizes:
+                sizes[path] = _loaded_bytes(path)
+        largest = max(largest, sizes[row.source] + sizes[row.target])
+    return int(_BASE_BYTES + largest)
+
+
+def choose_workers(wanted: int | None, each: int) -> tuple[int, int | None]:
+    """How many local processes to start, and the limit in bytes that each is held to.
+
+    Args:
+        wanted: None takes as many as there are cores and memory for.
+        each: what `worker_bytes` gave.
+
+    Returns:
+        The number, and an equal share of the free memory; None where the system does not tell it.
+
+    Raises:
+        InputError: less than 1 worker, or more than fit into memory.
+    """
+    if wanted is not None and wanted < 1:
+        raise InputError(f"there must be at least 1 worker, found {wanted}")
+    memory = Machine().memory()
+    if memory is None:
+        return wanted or usable_cores(), None
+    free = int((1 - _KEPT_FREE) * memory[0])
+    fitting = max(1, free // each)
+    if wanted is not None and wanted > fitting:
+        raise InputError(
+            f"{wanted} workers would take about {gibibytes(wanted * each)}, but only {gibibytes(free)} are "
+            f"free; use at most --workers {fitting}"
+        )
+    workers = wanted or min(usable_cores(), fitting)
+    return workers, max(each, free // workers)
+
+
+def gibibytes(count: float) -> str:
+    """A number of bytes for the eye."""
+    return f"{count / 2**30:.1f} GiB"
+
+
+def _loaded_bytes(path: str) -> float:
+    try:
+        size = os.stat(path).st_size  # noqa: PTH116
+    except OSError:
+        return 0.0
+    return size * (_PER_COMPRESSED_BYTE if Path(path).suffix.lower() in _COMPRESSED else _PER_FILE_BYTE)

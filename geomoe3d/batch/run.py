@@ -1,0 +1,194 @@
+"""Many pairs registered into a folder: started, killed, gone on with, finished; on one machine or on many."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from geomoe3d.batch.memory import choose_workers, gibibytes, worker_bytes
+from geomoe3d.batch.store import BatchStore, Outcome, remove_batch
+from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
+from geomoe3d.batch.task import Settings, Task, as_record, register_pair
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.errors import InputError
+from geomoe3d.transform_files import has_transform, save_transform
+from geomoe3d.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
+
+ALL_THAT_FIT = 0
+
+
+@dataclass(frozen=True)
+class BatchReport:
+    """What a batch came to.
+
+    Attributes:
+        folder: of the batch.
+        outcomes: one per pair, in the order given.
+        made: pairs done by this call.
+        kept: pairs that were done already.
+    """
+
+    folder: Path
+    outcomes: tuple[Outcome, ...]
+    made: int
+    kept: int
+
+    @property
+    def ok(self) -> bool:
+        """True where every pair is sure."""
+        return all(outcome.status == "ok" for outcome in self.outcomes)
+
+    def counts(self) -> dict[str, int]:
+        """Number of pairs by status, the frequent first."""
+        found: dict[str, int] = {}
+        for outcome in self.outcomes:
+            found[outcome.status] = found.get(outcome.status, 0) + 1
+        return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
+
+
+@dataclass(frozen=True)
+class Labour:
+    """Who does the work.
+
+    Attributes:
+        workers: local processes; None: this process; 0: as many as cores and memory allow.
+        scheduler: address of a Dask scheduler, whose workers are used instead.
+        cache: folder of described clouds; None: the user's own on each machine; empty: none.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
+    cache: str | None = None
+
+    def pool(self, rows: list[PairRow], say: Callable[[str], None]) -> Pool:
+        """Where to run, after saying how much memory it takes.
+
+        Raises:
+            InputError, DependencyError: as the pools of `geomoe3d.workers` and `choose_workers`.
+        """
+        each = worker_bytes(rows)
+        if self.scheduler is not None:
+            if self.workers is not None:
+                raise InputError("give either workers or a scheduler: a cluster has its own workers")
+            pool = DaskPool(self.scheduler)
+            say(f"{pool.describe()}; the largest pair takes about {gibibytes(each)} of a worker")
+            return pool
+        if self.workers is None:
+            say(f"this process; the largest pair takes about {gibibytes(each)}")
+            return SerialPool()
+        workers, limit = choose_workers(self.workers or None, each)
+        held = "" if limit is None else f", each held to {gibibytes(limit)}"
+        say(f"{workers} worker{'s' * (workers > 1)} of about {gibibytes(each)}{held}")
+        return ProcessPool(workers, threads=1, memory_limit=limit)  # the same bytes for any number of workers
+
+
+def register_pairs(
+    pairs: str | os.PathLike[str] | Iterable[PairLike | PairRow],
+    out: str | os.PathLike[str],
+    *,
+    config: RegistrationConfig | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    transforms: bool = False,
+    page: bool = False,
+    fresh: bool = False,
+    retry: bool = False,
+    cache: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> BatchReport:
+    """Register many pairs into a folder, where an interrupted batch is gone on with.
+
+    Called again with the same folder it does what is missing: new pairs, and pairs whose row or files
+    changed. A cloud that cannot be read fails its own pairs alone. Answers do not depend on who did the work.
+
+    Args:
+        pairs: a CSV file as `geomoe3d.batch.table.read_pairs` explains, or (source, target) paths.
+        out: folder; made if missing. ``journal.jsonl`` grows as pairs are finished, ``results.jsonl`` is
+            written in the end.
+        config: of all pairs; None takes the defaults.
+        workers: local processes, 0 as many as fit; None works in this process. More than one process needs
+            the caller's script to be importable (``if __name__ == "__main__":``).
+        scheduler: address of a Dask scheduler instead; its workers must see the files under the same paths.
+        transforms: write ``transforms/<id>.txt`` for every pair that has a transform.
+        page: write ``page.html`` with a picture of every pair.
+        fresh: forget what the folder holds of an earlier batch.
+        retry: do the pairs again that could not be registered.
+        cache: folder of described clouds; None: the user's own; "": none.
+        progress: called with (pairs done, pairs in all).
+        say: called with a sentence on workers and memory before the work begins.
+
+    Raises:
+        InputError: a table that cannot be used, or a folder with results of another configuration.
+        DependencyError: Dask is not installed, or a worker has other versions.
+        OutputError: the folder cannot be written, or another process is writing it.
+    """
+    is_table = isinstance(pairs, (str, os.PathLike))
+    rows = read_pairs(pairs) if is_table else as_rows(pairs)  # type: ignore[arg-type]
+    folder = Path(out)
+    if fresh:
+        remove_batch(folder)
+    store = BatchStore(folder, config or RegistrationConfig())
+    labour = Labour(workers, scheduler, cache)
+    records, kept = work(rows, store, config or RegistrationConfig(), labour, retry, progress, say)
+    outcomes = tuple(store.outcome(records[row.id]) for row in rows)
+    store.write_results(records[row.id] for row in rows)
+    if transforms:
+        write_transforms(folder / "transforms", outcomes)
+    if page:
+        from geomoe3d.batch.page import save_batch_page
+
+        save_batch_page(folder / "page.html", rows, outcomes)
+    return BatchReport(folder, outcomes, len(rows) - kept, kept)
+
+
+def work(
+    rows: list[PairRow],
+    store: BatchStore,
+    config: RegistrationConfig,
+    labour: Labour,
+    retry: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> tuple[dict[str, dict[str, Any]], int]:
+    """Records of all rows by id, those that were missing made now, and how many were there."""
+    wanted = {row.id: row.fingerprint() for row in rows}
+    with store.journal() as journal:
+        records = store.finished(wanted, with_errors=not retry)
+        kept = len(records)
+        if progress is not None:
+            progress(kept, len(rows))
+        missing = [row for row in rows if row.id not in records]
+        if not missing:
+            return records, kept
+        pool = labour.pool(missing, say or (lambda text: None))
+        settings = Settings.of(config, labour.cache)
+        tasks = (Task(row, wanted[row.id], settings) for row in missing)
+        for task, made in run_surviving(pool, register_pair, tasks):
+            name = task.row.id
+            if isinstance(made, WorkerDied):
+                made = as_record(name, task.fingerprint, None, made.reason)
+            journal.append(made)
+            records[name] = made
+            if progress is not None:
+                progress(len(records), len(rows))
+    return records, kept
+
+
+def write_transforms(folder: Path, outcomes: Iterable[Outcome]) -> None:
+    """One text file per outcome that has a transform, named by its id (odd characters as %XX)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for outcome in outcomes:
+        result = outcome.result
+        if result is not None and has_transform(result):
+            names = f"SOURCE ({result.source.name}) into TARGET ({result.target.name})"
+            comments = [
+                f"maps {names}: p_target = R p_source + t",
+                f"status {result.status}, confidence {result.confidence:.4f}",
+            ]
+            name = quote(outcome.id, safe=" +=,@")
+            save_transform(folder / f"{name}.txt", result.T_target_source, comments, force=True)

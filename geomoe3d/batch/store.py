@@ -1,0 +1,199 @@
+"""The folder of a batch: what it depends on, a journal of finished pairs, and the results in order.
+
+``run.json`` holds the configuration and versions that decide every answer; a folder is only gone on with
+under the same. ``journal.jsonl`` gets one line as each pair is finished. ``results.jsonl`` is written in the
+end, in the order of the table and without times: the same bytes whoever worked on it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from geomoe3d.answer import library_versions
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.files import write_atomically
+from geomoe3d.journal import Journal, read_journal
+from geomoe3d.provenance import hardware, source_commit
+from geomoe3d.result import RegistrationResult
+
+RUN_FILE, JOURNAL_FILE, RESULTS_FILE = "run.json", "journal.jsonl", "results.jsonl"
+_FORMAT = "geomoe3d batch 1"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one pair.
+
+    Attributes:
+        id: of the pair.
+        result: the answer, or None where the pair could not be registered at all.
+        error: the reason then.
+    """
+
+    id: str
+    result: RegistrationResult | None
+    error: str | None
+
+    @property
+    def status(self) -> str:
+        """That of the result, or ``error``."""
+        return "error" if self.result is None else self.result.status
+
+    @property
+    def confidence(self) -> float:
+        """That of the result, or 0."""
+        return 0.0 if self.result is None else self.result.confidence
+
+
+class BatchStore:
+    """The folder of one batch.
+
+    Args:
+        folder: made if missing.
+        config: of all its pairs.
+
+    Raises:
+        InputError: the folder holds a batch of another configuration or version; names what differs.
+        OutputError: the folder cannot be made or written.
+        FormatError: a file in it is damaged.
+    """
+
+    def __init__(self, folder: Path, config: RegistrationConfig) -> None:
+        self.folder = folder
+        self._shared: dict[str, Any] = {
+            "config": config.model_dump(mode="json"),
+            "versions": library_versions(),
+            "seed": config.seed,
+        }
+        identity = {"format": _FORMAT, **self._shared, "weights": _weights_hash(config)}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+        path = folder / RUN_FILE
+        if path.is_file():
+            differing = _differences(_read_identity(path), identity)
+            if differing:
+                raise InputError(
+                    f"'{folder}' holds results of another batch; they differ in {'; '.join(differing)}. "
+                    "Give another folder, or --fresh (fresh=True) to begin anew"
+                )
+            return
+        text = {
+            "identity": identity,
+            "commit": source_commit(),
+            "hardware": hardware(),
+            "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        }
+        write_atomically(
+            path, lambda temporary: _put(temporary, json.dumps(text, indent=2) + "\n"), force=False
+        )
+
+    def journal(self) -> Journal:
+        """Open for appending; keeps a second process out."""
+        return Journal(self.folder / JOURNAL_FILE)
+
+    def finished(self, wanted: dict[str, str], *, with_errors: bool = True) -> dict[str, dict[str, Any]]:
+        """Records of the pairs that are done, by id; of a pair that was done twice, the last.
+
+        Args:
+            wanted: fingerprint by id; a record of another fingerprint is of another input and not counted.
+            with_errors: False leaves out the pairs that could not be registered.
+        """
+        found: dict[str, dict[str, Any]] = {}
+        for record in read_journal(self.folder / JOURNAL_FILE):
+            name = str(record.get("id"))
+            if name in wanted and record.get("fingerprint") == wanted[name]:
+                found[name] = record
+        if with_errors:
+            return found
+        return {name: record for name, record in found.items() if record.get("error") is None}
+
+    def outcome(self, record: dict[str, Any]) -> Outcome:
+        """A record as a result that can be used.
+
+        Raises:
+            FormatError: the record is damaged.
+        """
+        try:
+            name, plain, error = str(record["id"]), record["result"], record["error"]
+            if plain is None:
+                return Outcome(name, None, str(error))
+            whole = {**plain, **self._shared, "seconds": record.get("seconds", {})}
+            return Outcome(name, RegistrationResult.from_json(json.dumps(whole)), None)
+        except (KeyError, TypeError, InputError) as error:
+            raise FormatError(
+                f"'{self.folder / JOURNAL_FILE}' holds a line that is no result: {error}"
+            ) from None
+
+    def write_results(self, records: Iterable[dict[str, Any]]) -> Path:
+        """All records in the given order, without what differs from run to run."""
+        path = self.folder / RESULTS_FILE
+
+        def write(temporary: Path) -> None:
+            with temporary.open("w", encoding="utf-8", newline="\n") as stream:
+                for record in records:
+                    kept = {key: record[key] for key in ("id", "error", "result")}
+                    stream.write(json.dumps(kept, allow_nan=False, separators=(",", ":")) + "\n")
+
+        write_atomically(path, write, force=True)
+        return path
+
+
+def remove_batch(folder: Path) -> None:
+    """Delete what a batch keeps of itself; nothing else in the folder is touched.
+
+    Raises:
+        OutputError: a file cannot be removed.
+    """
+    for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE):
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot remove '{folder / name}': {error.strerror}") from None
+
+
+def _weights_hash(config: RegistrationConfig) -> str | None:
+    """Hash of the filter's weights where they are a file: another training must not mix with the old."""
+    name = config.filter.weights
+    if name is None or not Path(name).is_file():
+        return name
+    return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16]
+
+
+def _read_identity(path: Path) -> dict[str, Any]:
+    try:
+        identity = json.loads(path.read_text(encoding="utf-8"))["identity"]
+        return dict(identity)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"'{path}' does not describe a batch: {error!r}") from None
+
+
+def _differences(stored: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    old, new = _flat(stored), _flat(wanted)
+    return [
+        f"{key} ({old.get(key, 'absent')} there, {new.get(key, 'absent')} now)"
+        for key in sorted(old.keys() | new.keys())
+        if old.get(key) != new.get(key)
+    ]
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    rows: dict[str, str] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            rows.update(_flat(value, f"{prefix}{key}."))
+        else:
+            rows[prefix + key] = json.dumps(value)
+    return rows
+
+
+def _put(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")

@@ -1,0 +1,203 @@
+"""The table of pairs: read, checked as a whole before any work begins, every row with a fingerprint.
+
+A broken table is refused with the line that is at fault. A broken or missing cloud is not looked for here: it
+fails its own pair later.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
+from geomoe3d.geometry.se3 import check_motion
+from geomoe3d.transform_files import load_transform
+from geomoe3d.types import FloatArray
+
+MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
+"""Sixteen columns of an initial value, row by row."""
+
+PairLike = Sequence[Any]
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """One pair to be registered.
+
+    Attributes:
+        id: unique in its table.
+        source: absolute path.
+        target: absolute path.
+        initial: 16 numbers, row by row, of a first guess in file coordinates, or None.
+    """
+
+    id: str
+    source: str
+    target: str
+    initial: tuple[float, ...] | None = None
+
+    @property
+    def matrix(self) -> FloatArray | None:
+        """(4, 4) first guess, or None."""
+        return None if self.initial is None else np.array(self.initial).reshape(4, 4)
+
+    def fingerprint(self) -> str:
+        """Hash of all that the row says and of size and time of its files: other input, other hash."""
+        says = [self.source, self.target, self.initial, _stamp(self.source), _stamp(self.target)]
+        return hashlib.sha256(json.dumps(says).encode()).hexdigest()[:16]
+
+
+def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
+    """The rows of a CSV file with the columns source, target and, if wanted, id and initial values.
+
+    Separated by comma, semicolon or tab; relative paths are relative to the file. ``id`` is made of source
+    and target where it is not given. A first guess is the path of a transform file in the column
+    ``initial``, or 16 numbers in the columns T00 T01 ... T33; empty cells mean none. Other columns are
+    ignored.
+
+    Raises:
+        InputError: no such file, no rows, a duplicate id, a row without source or target, or a first guess
+            that is no rigid motion; names the line.
+        FormatError: no header with the two columns, or no text.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise FormatError(f"'{path}' is no text in UTF-8; save the table as CSV") from None
+    except OSError as error:
+        raise InputError(f"cannot read '{path}': {error.strerror}") from None
+    head = text.partition("\n")[0]
+    separator = max(",;\t", key=head.count)
+    reader = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
+    columns = [name.strip() for name in reader.fieldnames or []]
+    reader.fieldnames = columns
+    _check_columns(path, columns)
+    folder = path.parent.resolve()
+    rows, lines = [], []
+    try:
+        for cells in reader:
+            where = f"'{path}' line {reader.line_num}"
+            values = {key: (cells[key] or "").strip() for key in columns}
+            if any(values.values()):
+                rows.append(_row(values, folder, where))
+                lines.append(where)
+    except csv.Error as error:
+        raise FormatError(f"'{path}' line {reader.line_num}: {error}") from None
+    return check_rows(rows, lines, str(path))
+
+
+def as_rows(pairs: Iterable[PairLike | PairRow]) -> list[PairRow]:
+    """Rows of (source path, target path) or (source, target, first guess (4, 4)) in memory.
+
+    Raises:
+        InputError: none, a duplicate, or something else than paths; a batch sends paths to its workers.
+    """
+    rows = []
+    for number, pair in enumerate(pairs, start=1):
+        where = f"pair {number}"
+        if isinstance(pair, PairRow):
+            rows.append(pair)
+            continue
+        if isinstance(pair, str) or not 2 <= len(pair) <= 3:
+            raise InputError(f"{where}: expected (source, target) or (source, target, first guess)")
+        source, target = pair[0], pair[1]
+        if not all(isinstance(side, (str, os.PathLike)) for side in (source, target)):
+            raise InputError(f"{where}: source and target must be paths of files")
+        initial = None
+        if len(pair) == 3 and pair[2] is not None:
+            initial = _motion(pair[2], where)
+        name = f"{os.fspath(source)}+{os.fspath(target)}"
+        rows.append(PairRow(name, str(Path(source).resolve()), str(Path(target).resolve()), initial))
+    return check_rows(rows, [f"pair {number}" for number in range(1, len(rows) + 1)], "the list of pairs")
+
+
+def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow]:
+    """The rows, if there are any and no two share an id.
+
+    Raises:
+        InputError: none, or two.
+    """
+    if not rows:
+        raise InputError(f"{what} holds no pairs; give at least one row with source and target")
+    seen: dict[str, str] = {}
+    for row, line in zip(rows, lines, strict=True):
+        if row.id in seen:
+            raise InputError(
+                f"{line}: the id '{row.id}' is that of {seen[row.id]} too; give every pair its own in the "
+                "column id"
+            )
+        seen[row.id] = line
+    return rows
+
+
+def _check_columns(path: Path, columns: list[str]) -> None:
+    if not any(columns):
+        raise InputError(f"'{path}' is empty; its first line must name the columns source and target")
+    for wanted in ("source", "target"):
+        if columns.count(wanted) != 1:
+            close = get_close_matches(wanted, columns, n=1)
+            hint = f"; is '{close[0]}' meant?" if close and close[0] != wanted else ""
+            problem = "no column" if wanted not in columns else "more than one column"
+            raise FormatError(
+                f"'{path}' has {problem} '{wanted}' among {', '.join(columns)}{hint}; the first line must "
+                "name source and target, and may name id, initial, or T00 to T33"
+            )
+    present = [name for name in MATRIX_COLUMNS if name in columns]
+    if present and len(present) < 16:
+        missing = next(name for name in MATRIX_COLUMNS if name not in columns)
+        raise FormatError(
+            f"'{path}' has the column {present[0]} but not {missing}; a first guess needs all 16"
+        )
+    if present and "initial" in columns:
+        raise FormatError(f"'{path}' has both the column initial and T00 to T33; keep one of the two")
+
+
+def _row(values: dict[str, str], folder: Path, where: str) -> PairRow:
+    source, target = values["source"], values["target"]
+    for name in ("source", "target"):
+        if not values[name]:
+            raise InputError(f"{where}: the cell '{name}' is empty")
+    initial = None
+    cells = [values.get(name, "") for name in MATRIX_COLUMNS]
+    if values.get("initial"):
+        file = folder / values["initial"]
+        try:
+            initial = _motion(load_transform(file), where)
+        except GeoMoE3DError as error:
+            raise InputError(f"{where}: the first guess cannot be used: {error}") from None
+    elif any(cells):
+        try:
+            numbers = [float(cell) for cell in cells]
+        except ValueError:
+            raise InputError(
+                f"{where}: the first guess must be 16 numbers in T00 to T33, or none; found {cells}"
+            ) from None
+        initial = _motion(np.reshape(numbers, (4, 4)), where)
+    name = values.get("id") or f"{source}+{target}"
+    return PairRow(name, str((folder / source).resolve()), str((folder / target).resolve()), initial)
+
+
+def _motion(matrix: Any, where: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(value) for value in check_motion(matrix).ravel())
+    except InputError as error:
+        raise InputError(f"{where}: the first guess cannot be used: {error}") from None
+
+
+def _stamp(path: str) -> tuple[int, int] | None:
+    try:
+        status = Path(path).stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns

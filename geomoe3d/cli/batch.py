@@ -1,0 +1,109 @@
+"""``geomoe3d batch``: a table of pairs in, a folder of results out, gone on with after any interruption."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import click
+
+from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+
+if TYPE_CHECKING:
+    from geomoe3d.batch.run import BatchReport
+
+_SHOWN = 20
+_COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red", "error": "red"}
+
+
+@click.command(context_settings=HELP, short_help="Register many pairs, resumably, on one machine or more.")
+@click.argument("pairs", metavar="PAIRS.csv")
+@click.argument("out", metavar="OUT")
+@click.option("--workers", type=int, metavar="N", help="Local processes. [as many as cores and memory allow]")
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask scheduler instead.")
+@click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid, in the clouds' unit. [chosen]")
+@click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
+@click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
+@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
+@click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
+@click.option("--page", is_flag=True, help="Write OUT/page.html with a picture of every pair.")
+@click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier batch.")
+@click.option("--retry", is_flag=True, help="Try pairs again that could not be registered.")
+@click.option("--cache", metavar="FOLDER", help="Where described clouds are kept. [the user's cache folder]")
+@click.option("--no-cache", is_flag=True, help="Describe every cloud anew for every pair.")
+@click.option("--quiet", is_flag=True, help="No progress and no table.")
+@traceback_option
+@click.pass_context
+def command(
+    context: click.Context,
+    pairs: str,
+    out: str,
+    workers: int | None,
+    scheduler: str | None,
+    voxel_size: str | None,
+    seed: str | None,
+    config_file: str | None,
+    assignments: tuple[str, ...],
+    transforms: bool,
+    page: bool,
+    fresh: bool,
+    retry: bool,
+    cache: str | None,
+    no_cache: bool,
+    quiet: bool,
+) -> None:
+    """Register every pair of PAIRS.csv into the folder OUT.
+
+    The table has the columns source and target and may have id and a first guess: initial (a transform
+    file) or T00 to T33. Relative paths are relative to the table. Killed and started again, it goes on with
+    what is missing. A file that cannot be read fails its own pairs alone. Exit code 0 where every pair is
+    ok, 3 where some are not, 2 for unusable input.
+    """
+    from geomoe3d.cli.progress import count_display
+    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.config import load_config
+
+    named = {"voxel_size": voxel_size, "seed": seed}
+    given = [f"{key}={value}" for key, value in named.items() if value is not None]
+    config = load_config(config_file, [*assignments, *given])
+    from geomoe3d.batch.run import ALL_THAT_FIT, register_pairs
+
+    with stdout_to_stderr(), count_display("pairs", quiet) as progress:
+        report = register_pairs(
+            pairs,
+            out,
+            config=config,
+            workers=ALL_THAT_FIT if workers is None and scheduler is None else workers,
+            scheduler=scheduler,
+            transforms=transforms,
+            page=page,
+            fresh=fresh,
+            retry=retry,
+            cache="" if no_cache else cache,
+            progress=progress,
+            say=lambda text: None if quiet else click.echo(text, err=True),
+        )
+    if not quiet:
+        click.echo(table(report), color=False if os.environ.get("NO_COLOR") else None)
+    context.exit(0 if report.ok else NOT_SURE)
+
+
+def table(report: BatchReport) -> str:
+    """Counts by status, then the pairs that are not ok, the least sure first."""
+    total = len(report.outcomes)
+    before = f", {report.kept:,} of them before" if report.kept else ""
+    lines = [f"{total:,} pairs{before}; results in {report.folder / 'results.jsonl'}", ""]
+    for status, count in report.counts().items():
+        word = status.replace("_", " ") if status != "error" else "not registered"
+        lines.append(f"  {click.style(word, fg=_COLORS[status]):24} {count:>7,}  {count / total:6.1%}")
+    doubtful = sorted((o for o in report.outcomes if o.status != "ok"), key=lambda o: (o.confidence, o.id))
+    if doubtful:
+        lines.append("")
+    width = min(40, max((len(outcome.id) for outcome in doubtful[:_SHOWN]), default=0))
+    for outcome in doubtful[:_SHOWN]:
+        reason = outcome.error if outcome.result is None else "; ".join(outcome.result.reasons[-1:])
+        name = outcome.id if len(outcome.id) <= width else "…" + outcome.id[-(width - 1) :]
+        lines.append(f"  {name:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
+    if len(doubtful) > _SHOWN:
+        lines.append(f"  and {len(doubtful) - _SHOWN:,} more that are not ok")
+    return "\n".join(lines)

@@ -1,0 +1,89 @@
+"""A small picture of aligned clouds, drawn in milliseconds without any library: for pages of many pairs.
+
+Two views side by side, from above and from the front, because a wrong motion often looks right in one of
+them. Nearer points hide farther ones. Cost: linear in the points, some 5 ms for 10,000.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomoe3d.types import FloatArray
+from geomoe3d.visual.scene import SOURCE_COLOR, TARGET_COLOR
+
+Pixels = NDArray[np.uint8]
+_MARGIN = 0.04
+
+
+def draw_clouds(
+    clouds: list[FloatArray], colors: list[str], axes: FloatArray, *, width: int = 280, height: int = 150
+) -> bytes:
+    """A PNG of clouds that lie in one frame.
+
+    Args:
+        clouds: each (N, 3), one frame.
+        colors: one per cloud, #rrggbb.
+        axes: (3, 3) rows right, forward, up.
+        width, height: of the whole picture, pixels.
+
+    Returns:
+        PNG bytes with a transparent background; an empty picture where there are no points.
+    """
+    half = width // 2
+    pixels = np.zeros((height, width, 4), dtype=np.uint8)
+    points = np.concatenate([*clouds, np.zeros((0, 3))])
+    if len(points):
+        paint = np.array([_rgb(color) for color in colors], dtype=np.uint8)
+        kind = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+        seen = points @ axes.T
+        low, high = np.percentile(seen, [0.5, 99.5], axis=0)
+        scale = (1 - 2 * _MARGIN) * min(
+            half / max(high[0] - low[0], 1e-12), height / max((high - low)[1:].max(), 1e-12)
+        )
+        for column, (across, upward, depth) in enumerate(((0, 1, 2), (0, 2, 1))):
+            nearness = seen[:, depth] if depth == 2 else -seen[:, depth]
+            x = (seen[:, across] - (low + high)[across] / 2) * scale + half / 2
+            y = height / 2 - (seen[:, upward] - (low + high)[upward] / 2) * scale
+            _splat(pixels[:, column * half : (column + 1) * half], x, y, nearness, kind, paint)
+    return png(pixels)
+
+
+def pair_thumbnail(
+    source: FloatArray, target: FloatArray, axes: FloatArray, *, width: int = 280, height: int = 150
+) -> bytes:
+    """A PNG of a source that lies on its target, both (N, 3) in one frame; see `draw_clouds`."""
+    return draw_clouds([target, source], [TARGET_COLOR, SOURCE_COLOR], axes, width=width, height=height)
+
+
+def png(pixels: Pixels) -> bytes:
+    """Pixels (height, width, 4) as a PNG file."""
+    height, width = pixels.shape[:2]
+    rows = np.zeros((height, 1 + 4 * width), dtype=np.uint8)  # each row begins with its filter: none
+    rows[:, 1:] = pixels.reshape(height, -1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    body = zlib.compress(rows.tobytes(), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def _splat(
+    pixels: Pixels, x: FloatArray, y: FloatArray, nearness: FloatArray, kind: NDArray[np.int64], paint: Pixels
+) -> None:
+    """Points as single pixels, the nearest last."""
+    height, width = pixels.shape[:2]
+    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    order = np.flatnonzero(inside)[np.argsort(nearness[inside], kind="stable")]
+    pixels[row[order], column[order], :3] = paint[kind[order]]
+    pixels[row[order], column[order], 3] = 255
+
+
+def _rgb(color: str) -> tuple[int, int, int]:
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

@@ -1,0 +1,391 @@
+"""Many pairs: the table, the folder that survives kills, workers that die, the command and its page."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scans import SETTINGS, cut, scene
+
+from geomoe3d import register_pairs
+from geomoe3d.batch.memory import choose_workers, worker_bytes
+from geomoe3d.batch.store import JOURNAL_FILE, RESULTS_FILE
+from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
+from geomoe3d.config import load_config
+from geomoe3d.errors import DependencyError, FormatError, InputError, OutputError
+from geomoe3d.geometry.se3 import inverse
+from geomoe3d.journal import read_journal
+from geomoe3d.registration import Registrar
+from geomoe3d.transform_files import load_transform, save_transform
+from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
+
+CONFIG = load_config(None, SETTINGS)
+OPTIONS = [part for setting in SETTINGS for part in ("--set", setting)]
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A cache of described clouds of this file's own."""
+    kept = os.environ.get("GEOMOE3D_CACHE")
+    os.environ["GEOMOE3D_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    if kept is None:
+        del os.environ["GEOMOE3D_CACHE"]
+    else:
+        os.environ["GEOMOE3D_CACHE"] = kept
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """A folder with a.npy, b.npy, c.npy, a broken file and a table of five pairs, and the true poses."""
+    folder = tmp_path_factory.mktemp("scans")
+    points = scene()
+    poses = {}
+    for number, (name, low, high) in enumerate((("a", 0.0, 3.0), ("b", 0.8, 3.6), ("c", 0.4, 3.2))):
+        part, poses[name] = cut(points, low, high, seed=number)
+        np.save(folder / f"{name}.npy", part)
+    (folder / "broken.ply").write_bytes(b"ply\nnothing of use\n")
+    write_table(folder / "pairs.csv", [("ab", "a", "b"), ("ac", "a", "c"), ("bc", "b", "c")])
+    with (folder / "pairs.csv").open("a") as stream:
+        stream.write("bad,a.npy,broken.ply\ngone,missing.ply,b.npy\n")
+    return folder, poses
+
+
+def write_table(path, pairs):
+    lines = [f"{name},{source}.npy,{target}.npy" for name, source, target in pairs]
+    path.write_text("\n".join(["id,source,target", *lines]) + "\n")
+
+
+@pytest.fixture(scope="module")
+def finished(scans, tmp_path_factory):
+    """The table, done in this process."""
+    out = tmp_path_factory.mktemp("out") / "batch"
+    return register_pairs(scans[0] / "pairs.csv", out, config=CONFIG, transforms=True, page=True), out
+
+
+def run_cli(*arguments, check=None, **named):
+    done = subprocess.run(
+        [sys.executable, "-m", "geomoe3d", "batch", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=ROOT,
+        check=False,
+        **named,
+    )
+    if check is not None:
+        assert done.returncode == check, done.stderr
+    return done
+
+
+# ---- the table --------------------------------------------------------------------------------------
+
+
+def test_paths_are_relative_to_the_table_and_ids_are_made_where_missing(tmp_path):
+    (tmp_path / "t.csv").write_text("target;source\nsub/b.ply;/x/a.ply\n\n")
+    (row,) = read_pairs(tmp_path / "t.csv")
+    assert row.source == "/x/a.ply"
+    assert row.target == str(tmp_path / "sub" / "b.ply")
+    assert row.id == "/x/a.ply+sub/b.ply"
+    assert row.initial is None
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "message"),
+    [
+        ("", InputError, "is empty"),
+        ("source,target\n", InputError, "holds no pairs"),
+        ("sorce,target\na,b\n", FormatError, "no column 'source'.*is 'sorce' meant"),
+        ("a.ply,b.ply\n", FormatError, "no column 'source'"),
+        ("source,source,target\na,b,c\n", FormatError, "more than one column 'source'"),
+        ("id,source,target\nx,a,b\nx,a,c\n", InputError, "line 3: the id 'x' is that of .* line 2"),
+        ("source,target\na,b\na,b\n", InputError, "line 3: the id"),
+        ("source,target\na,\n", InputError, "line 2: the cell 'target' is empty"),
+        ("source,target,T00\na,b,1\n", FormatError, "T00 but not T01"),
+        ("source,target,initial\na,b,none.txt\n", InputError, "line 2: the first guess.*none.txt"),
+        ("source,target,initial," + ",".join(MATRIX_COLUMNS) + "\n", FormatError, "both the column"),
+        ("source,target," + ",".join(MATRIX_COLUMNS) + "\na,b" + ",2" * 16 + "\n", InputError, "no rigid"),
+        ("source,target," + ",".join(MATRIX_COLUMNS) + "\na,b" + ",x" * 16 + "\n", InputError, "16 numbers"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_refused_with_its_line(tmp_path, text, kind, message):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    with pytest.raises(kind, match=message):
+        read_pairs(path)
+
+
+def test_tables_that_are_no_text_or_not_there(tmp_path):
+    with pytest.raises(InputError, match="cannot read"):
+        read_pairs(tmp_path / "none.csv")
+    (tmp_path / "t.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="UTF-8"):
+        read_pairs(tmp_path / "t.csv")
+
+
+def test_first_guesses_from_columns_and_from_files_are_the_same_motion(tmp_path, scans):
+    _, poses = scans
+    T = inverse(poses["b"]) @ poses["a"]
+    for suffix in (".txt", ".npy"):
+        save_transform(tmp_path / f"guess{suffix}", T, [])
+    cells = ",".join(f"{value:.17g}" for value in T.ravel())
+    (tmp_path / "columns.csv").write_text(
+        "source,target," + ",".join(MATRIX_COLUMNS) + f"\na,b,{cells}\nc,d" + "," * 16 + "\n"
+    )
+    with_guess, without = read_pairs(tmp_path / "columns.csv")
+    assert np.allclose(with_guess.matrix, T, atol=1e-12)
+    assert without.matrix is None
+    (tmp_path / "files.csv").write_text("source,target,initial\na,b,guess.txt\nc,d,guess.npy\ne,f,\n")
+    rows = read_pairs(tmp_path / "files.csv")
+    assert rows[0].initial == rows[1].initial
+    assert np.allclose(rows[0].matrix, T, atol=1e-12)
+    assert rows[2].initial is None
+
+
+def test_a_transform_reads_back_bit_for_bit_from_every_format(tmp_path, finished):
+    result = finished[0].outcomes[0].result
+    (tmp_path / "t.json").write_text(result.to_json())
+    for suffix in (".txt", ".npy"):
+        save_transform(tmp_path / f"t{suffix}", result.T_target_source, ["hello"])
+    for suffix in (".txt", ".npy", ".json"):
+        assert load_transform(tmp_path / f"t{suffix}").tobytes() == result.T_target_source.tobytes()
+    (tmp_path / "short.txt").write_text("1 2\n3 4\n")
+    for name, kind in (("none.txt", InputError), ("short.txt", FormatError), ("t.xml", FormatError)):
+        with pytest.raises(kind):
+            load_transform(tmp_path / name)
+
+
+def test_pairs_in_memory(tmp_path):
+    rows = as_rows([("a", "b"), (Path("a"), Path("c"), np.eye(4))])
+    assert [row.id for row in rows] == ["a+b", "a+c"]
+    assert rows[1].matrix.tolist() == np.eye(4).tolist()
+    for bad in ([], ["ab"], [("a",)], [(np.zeros((3, 3)), "b")], [("a", "b"), ("a", "b")]):
+        with pytest.raises(InputError):
+            as_rows(bad)
+
+
+# ---- results ----------------------------------------------------------------------------------------
+
+
+def test_every_pair_has_its_answer_and_a_broken_file_fails_its_own_pair_alone(scans, finished):
+    _, poses = scans
+    report, _ = finished
+    assert [outcome.id for outcome in report.outcomes] == ["ab", "ac", "bc", "bad", "gone"]
+    for outcome in report.outcomes[:3]:
+        source, target = outcome.id
+        assert outcome.status == "ok"
+        T = inverse(poses[target]) @ poses[source]
+        assert np.abs(outcome.result.T_target_source - T).max() < 0.03
+    assert "broken.ply" in report.outcomes[3].error
+    assert "missing.ply" in report.outcomes[4].error
+    assert report.counts() == {"ok": 3, "error": 2}
+    assert not report.ok
+    assert (report.made, report.kept) == (5, 0)
+
+
+def test_a_result_is_what_register_gives(scans, finished):
+    folder, _ = scans
+    one = Registrar(CONFIG).register(folder / "a.npy", folder / "b.npy")
+    other = finished[0].outcomes[0].result
+    assert json.loads(one.to_json()) | {"seconds": 0} == json.loads(other.to_json()) | {"seconds": 0}
+
+
+def test_transforms_and_page_are_written(finished):
+    report, out = finished
+    assert sorted(path.name for path in (out / "transforms").iterdir()) == ["ab.txt", "ac.txt", "bc.txt"]
+    T = load_transform(out / "transforms" / "ab.txt")
+    assert T.tobytes() == report.outcomes[0].result.T_target_source.tobytes()
+    page = (out / "page.html").read_text()
+    assert page.count('src="data:image/png;base64,iVBOR') == 3
+    assert "http" not in page.replace("http-equiv", "")
+    order = [name for name in re.findall(r"<small>(\w+)</small>", page) if len(name) < 5]
+    sure = {outcome.id: outcome.confidence for outcome in report.outcomes}
+    assert [sure[name] for name in order] == sorted(sure.values())
+
+
+def test_called_again_nothing_is_done_again(scans, finished):
+    _, out = finished
+    before = (out / JOURNAL_FILE).read_bytes()
+    again = register_pairs(scans[0] / "pairs.csv", out, config=CONFIG)
+    assert (again.made, again.kept) == (0, 5)
+    assert (out / JOURNAL_FILE).read_bytes() == before
+    retried = register_pairs(scans[0] / "pairs.csv", out, config=CONFIG, retry=True)
+    assert (retried.made, retried.kept) == (2, 3)
+
+
+def test_two_processes_give_the_same_bytes(scans, finished, tmp_path):
+    _, out = finished
+    register_pairs(scans[0] / "pairs.csv", tmp_path / "two", config=CONFIG, workers=2, cache="")
+    assert (tmp_path / "two" / RESULTS_FILE).read_bytes() == (out / RESULTS_FILE).read_bytes()
+
+
+def test_another_configuration_never_mixes(scans, finished):
+    _, out = finished
+    other = load_config(None, [*SETTINGS, "seed=1"])
+    with pytest.raises(InputError, match=r"seed \(0 there, 1 now\)"):
+        register_pairs(scans[0] / "pairs.csv", out, config=other)
+
+
+def test_a_changed_row_or_file_is_done_again_and_the_rest_is_kept(scans, tmp_path):
+    folder, _ = scans
+    for name in "abc":
+        (tmp_path / f"{name}.npy").write_bytes((folder / f"{name}.npy").read_bytes())
+    table, out = tmp_path / "pairs.csv", tmp_path / "out"
+    write_table(table, [("1", "a", "b"), ("2", "a", "c")])
+    register_pairs(table, out, config=CONFIG)
+    write_table(table, [("2", "b", "c"), ("1", "a", "b")])
+    report = register_pairs(table, out, config=CONFIG)
+    assert (report.made, report.kept) == (1, 1)
+    assert report.outcomes[0].result.source.name == "b.npy"
+    assert [json.loads(line)["id"] for line in (out / RESULTS_FILE).read_text().splitlines()] == ["2", "1"]
+    np.save(tmp_path / "a.npy", np.load(tmp_path / "a.npy")[::2])
+    report = register_pairs(table, out, config=CONFIG)
+    assert (report.made, report.kept) == (1, 1)
+    fresh = register_pairs(table, out, config=CONFIG, fresh=True)
+    assert (fresh.made, fresh.kept) == (2, 0)
+
+
+def test_two_batches_in_one_folder_are_refused(scans, finished):
+    _, out = finished
+    from geomoe3d.journal import Journal
+
+    with Journal(out / JOURNAL_FILE), pytest.raises(OutputError, match="another process"):
+        register_pairs(scans[0] / "pairs.csv", out, config=CONFIG)
+
+
+# ---- workers that die --------------------------------------------------------------------------------
+
+
+def square(number):
+    return number * number
+
+
+def die_once(job):
+    """Kills its own process the first time that a number is tried."""
+    number, folder = job
+    mark = Path(folder) / str(number)
+    if number % 3 == 0 and not mark.exists():
+        mark.write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die_always(number):
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def complain(number):
+    raise InputError(f"number {number}")
+
+
+def hungry(_):
+    return len(bytearray(3 << 30))
+
+
+def test_results_of_a_pool_that_loses_no_worker():
+    found = dict(run_surviving(SerialPool(), square, range(7)))
+    assert found == {k: k * k for k in range(7)}
+    assert list(run_surviving(SerialPool(), square, [])) == []
+    with pytest.raises(InputError, match="number 0"):
+        list(run_surviving(SerialPool(), complain, range(3)))
+
+
+def test_workers_that_are_killed_lose_nothing_and_repeat_no_result(tmp_path):
+    jobs = [(number, str(tmp_path)) for number in range(8)]
+    found = [made for _, made in run_surviving(ProcessPool(2), die_once, jobs)]
+    assert sorted(found) == list(range(8))
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_item_that_kills_every_worker_is_given_up_alone():
+    found = dict(run_surviving(ProcessPool(2), die_always, range(5)))
+    assert isinstance(found.pop(2), WorkerDied)
+    assert found == {k: k for k in (0, 1, 3, 4)}
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory as Linux has them")
+def test_a_worker_is_held_to_its_memory():
+    with pytest.raises(MemoryError):
+        list(run_surviving(ProcessPool(1, memory_limit=1 << 30), hungry, [0]))
+
+
+def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):
+    rows = read_pairs(scans[0] / "pairs.csv")
+    each = worker_bytes(rows)
+    assert 2**28 < each < 2**30
+    monkeypatch.setattr("geomoe3d.machine.Machine.memory", lambda self: (3 * each, 4 * each))
+    assert choose_workers(2, each) == (2, int(0.9 * 3 * each) // 2)
+    with pytest.raises(InputError, match=r"at most --workers 2"):
+        choose_workers(3, each)
+    assert choose_workers(None, 100 * each)[0] == 1
+    with pytest.raises(InputError, match="at least 1"):
+        choose_workers(0, each)
+
+
+# ---- the command ------------------------------------------------------------------------------------
+
+
+def test_the_command_says_what_it_will_take_and_exits_with_three(scans, finished, tmp_path):
+    done = run_cli(scans[0] / "pairs.csv", tmp_path / "o", *OPTIONS, "--workers", "1", check=3)
+    assert re.search(r"1 worker of about 0\.\d GiB, each held to [\d.]+ GiB", done.stderr)
+    assert "5 of 5 pairs" in done.stderr
+    assert re.search(r"ok +3 +60\.0%", done.stdout)
+    assert "broken.ply" in done.stdout
+    assert (tmp_path / "o" / RESULTS_FILE).read_bytes() == (finished[1] / RESULTS_FILE).read_bytes()
+
+
+def test_exit_codes_of_a_good_and_of_an_unusable_table(scans, finished, tmp_path):
+    good = tmp_path / "good.csv"
+    good.write_text(f"id,source,target\nab,{scans[0] / 'a.npy'},{scans[0] / 'b.npy'}\n")
+    done = run_cli(good, finished[1], *OPTIONS, "--quiet", check=0)  # done there already
+    assert done.stdout == done.stderr == ""
+    assert "holds no pairs" not in run_cli(tmp_path / "none.csv", tmp_path / "x", check=2).stderr
+    assert not (tmp_path / "x").exists()
+
+
+def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_path):
+    table, out = tmp_path / "many.csv", tmp_path / "out"
+    names = [("a", "b"), ("a", "c"), ("b", "c"), ("b", "a"), ("c", "a"), ("c", "b")]
+    lines = [f"{k}-{s}{t},{scans[0] / s}.npy,{scans[0] / t}.npy" for k in range(3) for s, t in names]
+    table.write_text("\n".join(["id,source,target", *lines]) + "\n")
+    command = [sys.executable, "-m", "geomoe3d", "batch", str(table), str(out), *OPTIONS, "--workers", "1"]
+    running = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    journal = out / JOURNAL_FILE
+    while time.monotonic() < deadline and (not journal.exists() or journal.read_bytes().count(b"\n") < 3):
+        time.sleep(0.02)
+    running.kill()
+    running.wait()
+    before = [record["id"] for record in read_journal(journal)]
+    assert 3 <= len(before) < 18
+    report = register_pairs(table, out, config=CONFIG)
+    assert report.kept == len(before)
+    done = [record["id"] for record in read_journal(journal)]
+    assert sorted(done) == sorted(line.split(",")[0] for line in lines)
+    assert done[: len(before)] == before
+
+
+def test_without_dask_a_scheduler_names_the_extra(scans, tmp_path, monkeypatch):
+    import geomoe3d.workers as workers
+
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(workers, "import_module", absent)
+    with pytest.raises(DependencyError, match=r"geomoe3d\[dask\]"):
+        register_pairs(scans[0] / "pairs.csv", tmp_path / "o", config=CONFIG, scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(InputError, match="either workers or a scheduler"):
+        register_pairs(
+            scans[0] / "pairs.csv", tmp_path / "o", config=CONFIG, workers=1, scheduler="tcp://127.0.0.1:1"
+        )

@@ -79,19 +79,24 @@ def test_map_coordinates_do_not_matter(name):
     assert np.abs(moved - transform_points(MOTION, rows[:, :3])).max() < 0.15
 
 
-def test_ransac_says_which_are_inliers():
-    rows = correspondences(0.5)
-    answer = Open3DRansac()(MethodInput("room/0-1", correspondences=rows))
-    residuals = np.linalg.norm(transform_points(answer.T_target_source, rows[:, :3]) - rows[:, 3:], axis=1)
-    assert answer.inliers is not None
-    assert (residuals[answer.inliers] < 0.12).all()  # its set is that of the motion before the last fit
-    assert (residuals[~answer.inliers] > 0.08).all()
-    assert 200 <= answer.inliers.sum() < 215
+def test_ransac_that_found_nothing_says_so_though_points_lie_close():
+    """The two sets of points coincide, so that the library's own fitness is high at the identity."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-1, 1, (60, 3))
+    rows = np.hstack([points, points[rng.permutation(60)]])
+    T = Open3DRansac(iterations=50)(MethodInput("a/0-1", correspondences=rows)).T_target_source
+    if T is not None:  # a motion by chance: then rows must agree with it
+        residuals = np.linalg.norm(transform_points(T, rows[:, :3]) - rows[:, 3:], axis=1)
+        assert (residuals < 0.1).sum() >= 3
+    scaled = np.hstack([points, 9 * points])
+    assert Open3DRansac()(MethodInput("a/0-1", correspondences=scaled)).T_target_source is None
 
 
 @pytest.mark.parametrize("name", ["open3d-feature-ransac", "kiss-matcher"])
 def test_lands_on_clouds(name, room):
     peer = present(name)
+    if isinstance(peer, Open3DFeatureRansac):
+        peer.iterations = 20_000  # enough for this pair
     source, target, T = room
     answer = peer(clouds(source, target))
     assert answer.T_target_source is not None
@@ -157,8 +162,8 @@ def test_same_seed_same_answer(name):
 
 def test_feature_ransac_is_seeded(room):
     source, target, _ = room
-    peer = Open3DFeatureRansac(iterations=500)
-    one, two = (peer(clouds(source, target)).T_target_source.tobytes() for _ in range(2))
+    given = MethodInput("room/0-1", source=source, target=target, voxel_size=0.1, seed=2)
+    one, two = (Open3DFeatureRansac(iterations=5000)(given).T_target_source.tobytes() for _ in range(2))
     assert one == two
 
 

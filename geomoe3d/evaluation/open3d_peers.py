@@ -13,8 +13,9 @@ import numpy as np
 
 from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, LEAST_MATCHED, Peer
 from geomoe3d.evaluation.records import Answer, MethodInput
+from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.stages import StageClock
-from geomoe3d.types import BoolArray, FloatArray
+from geomoe3d.types import FloatArray
 
 
 @dataclass(kw_only=True)
@@ -36,7 +37,11 @@ class Open3DRansac(Peer):
     edge_length_similarity: float = 0.9
 
     def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
-        """See `Peer.register`. Inliers are Open3D's own set."""
+        """See `Peer.register`.
+
+        Open3D's ``correspondence_set`` pairs nearest points under its motion and is no classification of the
+        given rows; after a failed search that motion is the identity, which may well bring points together.
+        """
         import open3d as o3d
 
         registration = o3d.pipelines.registration
@@ -51,12 +56,9 @@ class Open3DRansac(Peer):
             [registration.CorrespondenceCheckerBasedOnEdgeLength(self.edge_length_similarity)],
             registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
         )
-        inliers: BoolArray = np.zeros(len(source), dtype=np.bool_)
-        found = np.asarray(answer.correspondence_set)
-        if len(found) < 3:
-            return Answer(None, inliers=inliers)
-        inliers[found[:, 0]] = True
-        return Answer(np.array(answer.transformation), inliers=inliers)
+        T = np.array(answer.transformation)
+        residuals = np.linalg.norm(transform_points(T, source) - target, axis=1)
+        return Answer(T if not _is_identity(T) and (residuals < given.inlier_threshold).sum() >= 3 else None)
 
 
 @dataclass(kw_only=True)
@@ -97,7 +99,7 @@ class Open3DFastGlobal(Peer):
             _cloud(source), _cloud(target), _paired(len(source)), option
         )
         T = np.array(answer.transformation)
-        return Answer(None if np.array_equal(T, np.eye(4)) else T)
+        return Answer(None if _is_identity(T) else T)
 
 
 @dataclass(kw_only=True)
@@ -157,8 +159,9 @@ class Open3DFeatureRansac(Peer):
             registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
         )
         stages = {name: value for name, value in clock.stop().items() if name != "total"}
-        failed = answer.fitness == 0 or len(answer.correspondence_set) < 3
-        return Answer(None if failed else np.array(answer.transformation), seconds=stages)
+        T = np.array(answer.transformation)
+        failed = _is_identity(T) or len(answer.correspondence_set) < 3
+        return Answer(None if failed else T, seconds=stages)
 
 
 @dataclass(kw_only=True)
@@ -194,6 +197,11 @@ class IdentityIcp(Peer):
         )
         found = len(answer.correspondence_set) >= LEAST_MATCHED
         return Answer(np.array(answer.transformation) if found else None)
+
+
+def _is_identity(T: FloatArray) -> bool:
+    """Exactly, as no estimate from data is: what Open3D answers when it found nothing."""
+    return bool(np.array_equal(T, np.eye(4)))
 
 
 def _cloud(points: FloatArray) -> Any:

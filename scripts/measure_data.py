@@ -1,11 +1,11 @@
 """Measure what data preparation and loading cost on one core.
 
     python scripts/measure_data.py generation --scenes 3 --models FOLDER --mesh FILE
-    python scripts/measure_data.py memory --scenes 30
+    python scripts/measure_data.py memory --scenes 500 --models FOLDER --mesh FILE
     python scripts/measure_data.py loader SHARDS --pairs 400
 
 Times are processor seconds of this process, so that other work on the machine does not count; set
-OMP_NUM_THREADS=1. ``memory`` reports the resident size after every scene and its rise per scene.
+OMP_NUM_THREADS=1. ``memory`` reports the resident size at every fiftieth scene and its rise per scene.
 """
 
 from __future__ import annotations
@@ -45,27 +45,36 @@ def generation(scenes: int, models: tuple[str, ...], meshes: tuple[str, ...]) ->
 
 
 @main.command()
-@click.option("--scenes", default=30, show_default=True)
+@click.option("--scenes", default=500, show_default=True)
 @click.option("--models", multiple=True, type=click.Path(exists=True))
-def memory(scenes: int, models: tuple[str, ...]) -> None:
-    """Resident memory after every scene of one process; short fragments, full scenes."""
+@click.option("--mesh", "meshes", multiple=True, type=click.Path(exists=True))
+def memory(scenes: int, models: tuple[str, ...], meshes: tuple[str, ...]) -> None:
+    """Resident memory of one process over many scenes; full scenes, two short fragments each."""
     from geomoe3d.data.settings import SynthesisSettings
     from geomoe3d.data.synthesize import synthesize
 
     sizes: list[float] = []
-    settings = SynthesisSettings(fragments_per_scene=3, frames_per_fragment=4)
+
+    def note(done: int, total: int) -> None:
+        sizes.append(_resident_mb())
+        if done in (0, 1, total) or done % 50 == 0:
+            click.echo(f"after {done:4d} scenes: {sizes[-1]:.0f} MB, largest {max(sizes):.0f} MB")
+
+    start = time.process_time()
+    settings = SynthesisSettings(fragments_per_scene=2, frames_per_fragment=2, min_points=500)
     with tempfile.TemporaryDirectory() as folder:
         synthesize(
             Path(folder) / "rooms",
             scenes,
             settings=settings,
             model_folders=list(models),
-            progress=lambda done, total: sizes.append(_resident_mb()),
+            meshes=list(meshes),
+            progress=note,
         )
     half = np.array(sizes[len(sizes) // 2 :])
     rise = np.polyfit(np.arange(len(half)), half, 1)[0] if len(half) > 2 else float("nan")
-    click.echo(" ".join(f"{size:.0f}" for size in sizes))
-    click.echo(f"{rise:+.2f} MB per scene over the second half; largest {max(sizes):.0f} MB")
+    used = time.process_time() - start
+    click.echo(f"{rise:+.3f} MB per scene over the second half; {used:.0f} s of one core")
 
 
 def _resident_mb() -> float:

@@ -20,9 +20,10 @@ from geomoe3d.data.check import check_folder
 from geomoe3d.data.collection import load_fragment, open_collection
 from geomoe3d.data.rooms.arrange import MAKERS, PROGRAMS
 from geomoe3d.data.rooms.models import open_library
+from geomoe3d.data.rooms.relief import Relief, ReliefSettings
 from geomoe3d.data.rooms.scenes import Scene, generate_scene, load_mesh_scene
 from geomoe3d.data.rooms.sensor import Camera, DepthSensor, SensorSettings, cast
-from geomoe3d.data.rooms.shell import overlaps, plan_flat
+from geomoe3d.data.rooms.shell import Room, join, overlaps, plan_flat
 from geomoe3d.data.rooms.solids import Solids
 from geomoe3d.data.rooms.walk import WalkSettings, camera_pose, drifted, frame_poses, walk
 from geomoe3d.data.settings import SynthesisSettings
@@ -98,6 +99,18 @@ def test_rooms_of_a_flat_are_apart_and_joined() -> None:
         assert passages >= 2
 
 
+def test_a_doorway_may_take_all_the_wall_that_two_rooms_share() -> None:
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        start, length = rng.uniform(0.0, 5.0), rng.uniform(1.3, 1.6)
+        west = Room((0.0, 0.0, 3.0, 12.0), 2.5)
+        east = Room((3.12, start, 6.0, start + length), 2.5)
+        join(rng, [west, east])
+        ((door,), (same,)) = west.openings["east"], east.openings["west"]
+        assert (door.start, door.end) == (same.start, same.end)
+        assert start + 0.1 - 1e-9 <= door.start < door.end <= start + length - 0.1 + 1e-9
+
+
 def test_scene_depends_on_its_generator_alone() -> None:
     one, two = (generate_scene(np.random.default_rng(5)) for _ in range(2))
     other = generate_scene(np.random.default_rng(6))
@@ -118,6 +131,48 @@ def test_cast_depth_is_exact() -> None:
     hits = cast(wall_scene().rays, SMALL, camera_pose(np.zeros(3), 0, 0, 0))
     assert np.allclose(hits.depth, 3.0, atol=1e-5)
     assert hits.slope.max() == pytest.approx(1.0, abs=1e-4)
+
+
+def bent(scene: Scene, settings: ReliefSettings, pose: np.ndarray, seed: int = 3) -> tuple[np.ndarray, ...]:
+    """World points (n, 3) of an image before and after bending."""
+    hits = cast(scene.rays, SMALL, pose)
+    relief = Relief(np.random.default_rng(seed), scene.solids, settings)
+    moved = relief.bend(hits, SMALL.rays(), pose)
+    return tuple(transform_points(pose, SMALL.rays() * h.depth.reshape(-1, 1)) for h in (hits, moved))
+
+
+def test_relief_is_fixed_in_the_world_and_as_steep_as_asked() -> None:
+    settings = ReliefSettings(bend=0.2, spread=0.0, structure=1.0)
+    poses = [camera_pose(np.array([0, y, 0.0]), yaw, 0, 0) for y, yaw in ((-0.5, 9.0), (0.5, -9.0))]
+    slopes = []
+    for seed in range(12):
+        seen: list[dict[tuple[int, int], float]] = []
+        for pose in poses:
+            flat, uneven = bent(wall_scene(), settings, pose, seed)
+            assert np.allclose(flat[:, 0], 3.0, atol=1e-4)
+            # How far the surface stands out in the cells of a grid on the wall, in metres.
+            cells = np.floor(uneven[:, 1:] / 0.05).astype(int).tolist()
+            heights = dict(zip(map(tuple, cells), (uneven[:, 0] - 3.0).tolist(), strict=True))
+            for step in ((1, 0), (0, 1)):
+                next_cell = {(y, z): (y + step[0], z + step[1]) for y, z in heights}
+                rise = [heights[b] - heights[a] for a, b in next_cell.items() if b in heights]
+                slopes.append(np.mean(np.square(rise)) / 0.05**2)
+            seen.append(heights)
+        both = sorted(set(seen[0]) & set(seen[1]))
+        one, two = (np.array([heights[cell] for cell in both]) for heights in seen)
+        assert len(both) > 300
+        assert np.corrcoef(one, two)[0, 1] > 0.9
+    assert np.sqrt(2 * np.mean(slopes)) == pytest.approx(0.2, rel=0.25)  # along both axes of the wall
+
+
+def test_relief_spares_structure_and_can_be_none() -> None:
+    pose = camera_pose(np.zeros(3), 20, 0, 0)
+    flat, still = bent(wall_scene(), ReliefSettings(bend=0.0), pose)
+    assert np.array_equal(flat, still)
+    flat, weak = bent(wall_scene(), ReliefSettings(spread=0.0, structure=0.25), pose)
+    _, full = bent(wall_scene(), ReliefSettings(spread=0.0, structure=1.0), pose)
+    ratio = (full - flat).std() / (weak - flat).std()
+    assert ratio == pytest.approx(4.0, rel=0.01)
 
 
 def test_sensor_rounds_the_disparity() -> None:
@@ -197,10 +252,11 @@ def test_frames_begin_at_the_stand_and_drift_is_none_at_the_first() -> None:
 
 
 def test_fragments_lie_on_the_surfaces_of_their_scene() -> None:
-    """Ground truth is exact: without noise and drift, fused points moved by their pose meet the scene."""
+    """Ground truth is exact: with nothing disturbed, fused points moved by their pose meet the scene."""
     import open3d as o3d
 
-    settings = TINY.model_copy(update={"sensor": CLEAN, "drift_metres": 0.0, "drift_deg": 0.0})
+    ideal = {"sensor": CLEAN, "relief": ReliefSettings(bend=0.0), "drift_metres": 0.0, "drift_deg": 0.0}
+    settings = TINY.model_copy(update=ideal)
     scene = generate_scene(np.random.default_rng(21))
     recorded = record_module.record(np.random.default_rng(4), scene, settings)
     assert len(recorded.clouds) >= 2

@@ -13,6 +13,7 @@ import numpy as np
 
 from geomoe3d.data.fusion import FusionSettings, fuse, thin
 from geomoe3d.data.rooms.models import ModelLibrary
+from geomoe3d.data.rooms.relief import Relief
 from geomoe3d.data.rooms.scenes import Scene, generate_scene, load_mesh_scene
 from geomoe3d.data.rooms.sensor import KINECT, DepthSensor, cast
 from geomoe3d.data.rooms.walk import drifted, frame_poses, walk
@@ -50,12 +51,14 @@ def record(rng: np.random.Generator, scene: Scene, settings: SynthesisSettings) 
     """Walk through a scene and record its fragments; views that show too little are left out."""
     recorded = Recorded(scene)
     sensor = DepthSensor(KINECT, settings.sensor, rng)
+    relief = Relief(rng, scene.solids, settings.relief)
+    rays = KINECT.rays()
     for stand in walk(rng, scene, settings.fragments_per_scene, settings.walk):
         poses = frame_poses(rng, stand, settings.frames_per_fragment, settings.walk)
         believed = drifted(rng, poses, settings.drift_metres, settings.drift_deg)
         origin = inverse(stand.pose)
         frames = [
-            (sensor.measure(cast(scene.rays, KINECT, true)), origin @ thought)
+            (sensor.measure(relief.bend(cast(scene.rays, KINECT, true), rays, true)), origin @ thought)
             for true, thought in zip(poses, believed, strict=True)
         ]
         fusion = FusionSettings(settings.fusion_voxel, 3 * settings.fusion_voxel, settings.sensor.far)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from geomoe3d.config import Section
+from geomoe3d.data.rooms.relief import ReliefSettings
 from geomoe3d.data.rooms.sensor import SensorSettings
 from geomoe3d.data.rooms.walk import WalkSettings
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Raised whenever the same settings and seed give other bytes; stored in every data set."""
 
 
@@ -36,6 +37,7 @@ class SynthesisSettings(Section):
     drift_deg: float = Field(0.25, ge=0, description="error of each tracked angle after a fragment")
     min_points: int = Field(3000, ge=100, description="fragments with fewer points are recorded elsewhere")
     min_overlap: float = Field(0.1, ge=0, le=1, description="least overlap of a pair in gt.log")
+    relief: ReliefSettings = ReliefSettings()
     sensor: SensorSettings = SensorSettings()
     walk: WalkSettings = WalkSettings()
 

@@ -52,11 +52,13 @@ class Hits:
         depth: (H, W) metres along the optical axis, inf where nothing was met.
         slope: (H, W) cosine between ray and surface normal in [0, 1], 0 where nothing was met.
         triangle: (H*W,) index of the triangle.
+        normal: (H*W, 3) float32 of the surface in the world, of either sign.
     """
 
     depth: FloatArray
     slope: FloatArray
     triangle: IntArray
+    normal: Float32Array
 
 
 class SensorSettings(Section):
@@ -100,7 +102,8 @@ def cast(scene: Any, camera: Camera, T_world_camera: FloatArray) -> Hits:
     shape = (camera.height, camera.width)
     depth = hits["t_hit"].numpy().astype(np.float64).reshape(shape)
     slope = np.abs(np.einsum("ij,ij->i", directions, normals)).reshape(shape)
-    return Hits(depth, np.where(np.isfinite(depth), slope, 0.0), hits["primitive_ids"].numpy())
+    slope = np.where(np.isfinite(depth), slope, 0.0)
+    return Hits(depth, slope, hits["primitive_ids"].numpy(), hits["primitive_normals"].numpy())
 
 
 class DepthSensor:

@@ -74,7 +74,7 @@ def plan_flat(rng: np.random.Generator, num_rooms: int) -> list[Room]:
             rects += [(x0, y0, x1, middle - _WALL / 2), (x0, middle + _WALL / 2, x1, y1)]
     height = float(rng.uniform(2.3, 3.2))
     rooms = [Room(rect, height) for rect in rects]
-    shared = _join(rng, rooms)
+    shared = join(rng, rooms)
     for room in rooms:
         for side in SIDES:
             if (id(room), side) not in shared:
@@ -135,7 +135,7 @@ def strip(room: Room, side: str, start: float, end: float, depth: float) -> Rect
     }[side]
 
 
-def _join(rng: np.random.Generator, rooms: list[Room]) -> set[tuple[int, str]]:
+def join(rng: np.random.Generator, rooms: list[Room]) -> set[tuple[int, str]]:
     """Doorways between neighbours; gives the sides that face another room."""
     shared = set()
     for first in rooms:
@@ -151,7 +151,8 @@ def _join(rng: np.random.Generator, rooms: list[Room]) -> set[tuple[int, str]]:
                     continue
                 width = float(rng.uniform(0.8, 1.0)) if rng.random() < 0.75 else float(rng.uniform(1.1, 2.0))
                 width = min(width, high - low - 0.2)
-                start = float(rng.uniform(low + 0.1, high - 0.1 - width))
+                # The least place and the most can be one, and rounding turns them round.
+                start = float(rng.uniform(low + 0.1, max(high - 0.1 - width, low + 0.1)))
                 top = float(rng.uniform(1.98, 2.1))
                 for room, where, leaf in ((first, side, rng.random() < 0.5), (second, other, False)):
                     kind = "door ajar" if leaf and width < 1.05 else "passage"

@@ -19,7 +19,6 @@ from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.types import FloatArray
 
 _FINDER = Camera(40, 30, 36.5)  # a Kinect's view in few pixels
-_CANDIDATES = 10
 
 
 class WalkSettings(Section):
@@ -35,17 +34,23 @@ class WalkSettings(Section):
         height: range of the camera above the floor, metres.
         pitch_deg: mean and standard deviation of looking up.
         clearance: least distance to any surface, metres.
+        min_share: share of the view that must be usable depth.
+        fit: views whose middle is nearer than this are wanted less, metres.
+        candidates: views of which the best is taken.
     """
 
-    step: float = 0.28
+    step: float = 0.33
     turn_deg: float = 18.0
     around: float = 0.4
-    around_deg: float = 65.0
+    around_deg: float = 74.0
     motion: float = 0.25
     motion_deg: float = 10.0
     height: tuple[float, float] = (1.0, 1.75)
     pitch_deg: tuple[float, float] = (-22.0, 14.0)
     clearance: float = 0.3
+    min_share: float = 0.35
+    fit: float = 1.6
+    candidates: int = 6
 
 
 @dataclass(frozen=True)
@@ -86,9 +91,9 @@ def walk(rng: np.random.Generator, scene: Scene, count: int, settings: WalkSetti
             stands[int(rng.integers(len(stands))) if around or failures % 5 == 4 else -1] if stands else None
         )
         candidates = []
-        for _ in range(_CANDIDATES):
+        for _ in range(settings.candidates):
             stand = _propose(rng, scene, last, around, settings)
-            score = _score(rng, scene, stand) if stand is not None else 0.0
+            score = _score(rng, scene, stand, settings) if stand is not None else 0.0
             if stand is not None and score > 0:
                 candidates.append((score, stand))
         if candidates:
@@ -197,7 +202,7 @@ def _is_free(scene: Scene, eye: FloatArray, clearance: float) -> bool:
     return float(scene.rays.compute_distance(point, nthreads=1).numpy()[0]) > clearance
 
 
-def _score(rng: np.random.Generator, scene: Scene, stand: Stand) -> float:
+def _score(rng: np.random.Generator, scene: Scene, stand: Stand, settings: WalkSettings) -> float:
     """How much a person would want to record this view: 0 for an unusable one.
 
     Counts what lies in the cube of a fragment (0.5 to 3.5 m ahead, 1.5 m to the sides), and prefers views
@@ -206,10 +211,10 @@ def _score(rng: np.random.Generator, scene: Scene, stand: Stand) -> float:
     hits = cast(scene.rays, _FINDER, stand.pose)
     usable = (hits.depth > 0.5) & (hits.depth < 3.5) & (hits.slope > 0.1)
     share = float(usable.mean())
-    if share < 0.45:
+    if share < settings.min_share:
         return 0.0
-    # Recorded fragments have their middle at 2.3 m: people step back until something fits the view.
-    fit = min(float(np.median(hits.depth[usable])) / 2.3, 1.0)
+    # People step back until something fits the view; recorded fragments have their middle at 2.3 m.
+    fit = min(float(np.median(hits.depth[usable])) / settings.fit, 1.0)
     return share * fit * (1.0 - 0.85 * _flatness(hits, usable, stand)) + 0.15 * float(rng.random())
 
 

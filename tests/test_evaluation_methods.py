@@ -87,13 +87,14 @@ def test_ours_land_among_wrong_correspondences(name):
     assert all(not np.array_equal(T, answer.T_target_source) for T in answer.hypotheses)
 
 
-def test_spectral_matching_weighs_and_lands():
+def test_spectral_matching_keeps_a_tenth_and_lands():
     rows = correspondences(0.6)
     answer = make_method("spectral")(pair_of(rows))
     assert lands(answer.T_target_source, degrees=3, metres=0.15)
     right = np.linalg.norm(transform_points(MOTION, rows[:, :3]) - rows[:, 3:], axis=1) < 0.1
-    assert answer.weights is not None
-    assert answer.weights[right].mean() > 5 * answer.weights[~right].mean()
+    assert answer.inliers is not None
+    assert answer.inliers.sum() == round(0.1 * len(rows))
+    assert right[answer.inliers].all()
 
 
 def test_plain_svd_is_least_squares_of_all_rows():

@@ -1,7 +1,7 @@
 """Methods by name: ours on correspondences and clouds, other people's, and a user's own function.
 
-``geomoe3d`` is the whole product with any configuration; ``consensus``, ``spectral`` and ``svd`` are parts
-of it with a fixed one, to compare against. Peers are in `peers`, functions of the user in `adapter`. The
+``geomoe3d`` is the whole product with any configuration; ``consensus`` and ``svd`` are parts of it with a
+fixed one, to compare against. Peers are in `peers`, functions of the user in `adapter`. The
 identity of ours holds the hash of the source that decides answers: a cache never mixes two versions of it.
 """
 
@@ -36,12 +36,11 @@ if TYPE_CHECKING:
 OURS: dict[str, tuple[str, ...]] = {
     "geomoe3d": (),
     "consensus": ("filter.name=none", "estimator.name=consensus"),
-    "spectral": ("filter.name=spectral", "estimator.name=svd"),
     "svd": ("filter.name=none", "estimator.name=svd"),
 }
 """Our methods and what each sets; all but ``geomoe3d`` take correspondences alone and are fixed."""
 
-_UNDECIDING = frozenset({"evaluation", "cli", "visual", "data", "training"})
+_UNDECIDING = frozenset({"evaluation", "cli", "visual", "data", "training", "batch", "multiway"})
 _UNDECIDING_FILES = frozenset(
     {
         "__main__.py",

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
 from geomoe3d.evaluation.open3d_peers import (
     IdentityIcp,
     Open3DFastGlobal,
@@ -20,8 +21,9 @@ from geomoe3d.evaluation.open3d_peers import (
 )
 from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, LEAST_MATCHED, Peer
 from geomoe3d.evaluation.records import Answer, MethodInput
+from geomoe3d.filters.spectral import SpectralFilter
 from geomoe3d.geometry.se3 import make_transform, shift_frames
-from geomoe3d.types import FloatArray
+from geomoe3d.types import Correspondences, FloatArray
 
 _SMALL_CLOUD = 3000
 
@@ -146,7 +148,39 @@ class GraphCutRansac(Peer):
         return Answer(shift_frames(np.array(T).T, low[:3], low[3:]))
 
 
+@dataclass(kw_only=True)
+class SpectralMatching(Peer):
+    """Spectral matching: the best tenth by the leading eigenvector of length compatibility, weighted SVD.
+
+    Source: Leordeanu and Hebert, ICCV 2005, with the share that registration papers keep. The eigenvector is
+    `geomoe3d.filters.spectral.SpectralFilter`.
+
+    Attributes:
+        kept_share: share of the correspondences that are fitted; these are its inliers.
+    """
+
+    name: str = "spectral"
+    module: str = "numpy"
+    distributions: tuple[str, ...] = ("numpy",)
+    inputs: frozenset[str] = CORRESPONDENCES
+    kept_share: float = 0.1
+
+    def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
+        """See `Peer.register`."""
+        rows = np.hstack([source, target])
+        weighed = SpectralFilter()(Correspondences(rows), voxel_size=given.voxel_size, seed=given.seed)
+        count = max(3, round(self.kept_share * len(rows)))
+        kept = np.zeros(len(rows), dtype=np.bool_)
+        kept[np.argsort(-weighed.weights, kind="stable")[:count]] = True
+        kept &= weighed.weights > 0
+        found = WeightedSvdEstimator()(
+            rows, np.where(kept, weighed.weights, 0), inlier_threshold=given.inlier_threshold
+        )
+        return Answer(found[0].T_target_source if found else None, inliers=kept)
+
+
 PEERS: dict[str, Callable[[], Peer]] = {
+    "spectral": SpectralMatching,
     "open3d-ransac-50k": Open3DRansac,
     "open3d-ransac-1m": lambda: Open3DRansac(name="open3d-ransac-1m", iterations=1_000_000),
     "open3d-feature-ransac": Open3DFeatureRansac,

@@ -94,10 +94,12 @@ def predict(
         progress: called with (predictions there, predictions in all).
 
     Raises:
-        InputError: an unknown method, benchmark or track; a method that cannot take the track's input; two
+        InputError: no worker; an unknown method, benchmark or track; a method that cannot take the track's input; two
             runs of one name; a folder with predictions of another identity.
         OutputError: the cache cannot be written, or a worker died.
     """
+    if workers < 1:
+        raise InputError(f"there must be at least 1 worker, found {workers}")
     wanted = needs(task.track)
     pairs = task.pairs()
     made = {spec: make_method(spec.spec, spec.assignments) for spec in methods}

@@ -94,8 +94,8 @@ def predict(
         progress: called with (predictions there, predictions in all).
 
     Raises:
-        InputError: no worker; an unknown method, benchmark or track; a method that cannot take the track's input; two
-            runs of one name; a folder with predictions of another identity.
+        InputError: no worker; an unknown method, benchmark or track; a method that cannot take the track's
+            input; two runs of one name; a folder with predictions of another identity.
         OutputError: the cache cannot be written, or a worker died.
     """
     if workers < 1:

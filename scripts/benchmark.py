@@ -23,7 +23,7 @@ from geomoe3d.evaluation.task import Task
 from geomoe3d.files import write_atomically
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
-ESTIMATORS = ("consensus", "spectral", "open3d-ransac-50k", "open3d-ransac-1m", "open3d-fgr", "gc-ransac")
+ESTIMATORS = ("consensus", "spectral", "open3d-ransac-50k", "open3d-fgr", "gc-ransac")
 SYSTEMS = ("geomoe3d", "kiss-matcher", "open3d-feature-ransac", "icp-identity", "small-gicp")
 
 
@@ -37,7 +37,9 @@ class Part:
 
 
 PARTS = (
-    Part("1k", ESTIMATORS, (Task("3DMatch", "1k"), Task("3DLoMatch", "1k"))),
+    # A million samples take seconds where inliers are rare, so that search sees the easier benchmark alone.
+    Part("1k", (*ESTIMATORS, "open3d-ransac-1m"), (Task("3DMatch", "1k"),)),
+    Part("1k", ESTIMATORS, (Task("3DLoMatch", "1k"),)),
     Part("all", ("consensus",), (Task("3DMatch", "all", every=8), Task("3DLoMatch", "all", every=8))),
     Part("clouds", SYSTEMS, (Task("3DMatch", "clouds", every=4), Task("3DLoMatch", "clouds", every=4))),
     Part("unrelated", ("geomoe3d",), (Task("unrelated", "clouds"),)),
@@ -49,7 +51,9 @@ def main() -> None:
     parser.add_argument("--out", default="runs/benchmark", help="folder of the predictions")
     parser.add_argument("--docs", default="docs/benchmark.md", help="document with the two marks")
     parser.add_argument("--workers", type=int, default=1, help="processes over pairs")
-    parser.add_argument("--only", action="append", choices=[part.name for part in PARTS], help="repeatable")
+    parser.add_argument(
+        "--only", action="append", choices=sorted({part.name for part in PARTS}), help="repeatable"
+    )
     parser.add_argument("--fresh", action="store_true", help="predict again")
     given = parser.parse_args()
     command = shlex.join(["python", "scripts/benchmark.py", *sys.argv[1:]])

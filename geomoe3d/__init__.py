@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         NonFiniteError,
         OutputError,
     )
+    from geomoe3d.multiway.run import register_scans
     from geomoe3d.registration import Registrar, register
     from geomoe3d.result import RegistrationResult
     from geomoe3d.types import Correspondences, PointCloud
@@ -55,6 +56,7 @@ __all__ = [
     "load_points",
     "register",
     "register_pairs",
+    "register_scans",
     "save_points",
 ]
 
@@ -62,6 +64,7 @@ _HOME = {
     "Registrar": "registration",
     "register": "registration",
     "register_pairs": "batch.run",
+    "register_scans": "multiway.run",
     "RegistrationResult": "result",
     "RegistrationConfig": "config",
     "load_config": "config",

@@ -96,10 +96,15 @@ def _registrar(settings: Settings) -> Registrar:
             f"{settings.versions} here; install the same everywhere"
         )
     config = build_config(RegistrationConfig, json.loads(settings.config))
-    cache = None
-    if settings.cache != "":
-        try:
-            cache = DescriptionCache(settings.cache or default_cache_folder())
-        except OutputError as error:
-            warnings.warn(f"described clouds are not kept: {error}", RuntimeWarning, stacklevel=2)
-    return Registrar(config, cache=cache)
+    return Registrar(config, cache=open_cache(settings.cache))
+
+
+def open_cache(folder: str | None) -> DescriptionCache | None:
+    """The cache in a folder; None: the user's own; empty, or a folder that cannot be made: none."""
+    if folder == "":
+        return None
+    try:
+        return DescriptionCache(folder or default_cache_folder())
+    except OutputError as error:
+        warnings.warn(f"described clouds are not kept: {error}", RuntimeWarning, stacklevel=2)
+        return None

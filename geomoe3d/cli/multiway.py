@@ -1,0 +1,116 @@
+"""``geomoe3d multiway``: many scans in, one model out, and why a scan could not be placed."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import click
+
+from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+
+if TYPE_CHECKING:
+    from geomoe3d.multiway.model import SceneModel
+
+_SHOWN = 20
+
+
+@click.command(context_settings=HELP, short_help="Place many scans in one model.")
+@click.argument("inputs", metavar="SCANS... OUT", nargs=-1, required=True)
+@click.option(
+    "--pairs", metavar="WHICH", default="auto", help="all, similar, or auto: all for up to 30 scans."
+)
+@click.option(
+    "--neighbors", type=int, default=10, metavar="N", help="Pairs proposed per scan and round. [10]"
+)
+@click.option(
+    "--model-voxel-size", type=float, metavar="LENGTH", help="Of the merged cloud. [that of the scans]"
+)
+@click.option("--workers", type=int, metavar="N", help="Local processes. [as many as cores and memory allow]")
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask scheduler instead.")
+@click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid of all scans. [chosen]")
+@click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
+@click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
+@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
+@click.option("--no-page", is_flag=True, help="Do not write OUT/page.html.")
+@click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier model.")
+@click.option("--cache", metavar="FOLDER", help="Where described clouds are kept. [the user's cache folder]")
+@click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@traceback_option
+@click.pass_context
+def command(
+    context: click.Context,
+    inputs: tuple[str, ...],
+    pairs: str,
+    neighbors: int,
+    model_voxel_size: float | None,
+    workers: int | None,
+    scheduler: str | None,
+    voxel_size: str | None,
+    seed: str | None,
+    config_file: str | None,
+    assignments: tuple[str, ...],
+    no_page: bool,
+    fresh: bool,
+    cache: str | None,
+    quiet: bool,
+) -> None:
+    """Place all SCANS (files, or folders of them) in one model, written to the folder OUT.
+
+    Scans that nothing sure connects stay in groups of their own; a scan that cannot be placed is listed with
+    the reason. Called again with more scans, all pairs of earlier calls are reused. Exit code 0 where all
+    scans stand in one group, 3 where not, 2 for unusable input.
+    """
+    from geomoe3d.cli.progress import count_display
+    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.config import load_config
+
+    if len(inputs) < 2:
+        raise click.UsageError("give at least one folder of scans, or two scans, and OUT last")
+    if model_voxel_size is not None and not model_voxel_size > 0:
+        raise click.UsageError(f"--model-voxel-size must be positive, found {model_voxel_size}")
+    named = {"voxel_size": voxel_size, "seed": seed}
+    given = [f"{key}={value}" for key, value in named.items() if value is not None]
+    config = load_config(config_file, [*assignments, *given])
+    from geomoe3d.batch.run import ALL_THAT_FIT
+    from geomoe3d.multiway.run import register_scans
+
+    with stdout_to_stderr(), count_display("pairs", quiet) as progress:
+        model = register_scans(
+            inputs[:-1],
+            inputs[-1],
+            config=config,
+            pairs=pairs,
+            neighbors=neighbors,
+            merged_voxel_size=model_voxel_size,
+            page=not no_page,
+            workers=ALL_THAT_FIT if workers is None and scheduler is None else workers,
+            scheduler=scheduler,
+            cache=cache,
+            fresh=fresh,
+            progress=progress,
+            say=lambda text: None if quiet else click.echo(text, err=True),
+        )
+    if not quiet:
+        click.echo(summary(model), color=False if os.environ.get("NO_COLOR") else None)
+    context.exit(0 if model.ok else NOT_SURE)
+
+
+def summary(model: SceneModel) -> str:
+    """Who stands where, and who does not."""
+    placed = sum(len(group.poses) for group in model.groups)
+    color = "green" if model.ok else "yellow"
+    kept = sum(edge.kept for edge in model.edges)
+    lines = [
+        click.style(f"{placed} of {len(model.scans)} scans placed", fg=color, bold=True)
+        + f"; {model.num_pairs:,} pairs registered, {kept:,} edges kept; model in {model.folder}",
+    ]
+    for number, group in enumerate(model.groups, start=1):
+        lines.append(f"  group {number}: {len(group.poses)} scans in the frame of '{group.reference}'")
+    if model.unplaced:
+        lines.append("not placed:")
+    for name, reason in list(model.unplaced.items())[:_SHOWN]:
+        lines.append(f"  {name}: {reason}")
+    if len(model.unplaced) > _SHOWN:
+        lines.append(f"  and {len(model.unplaced) - _SHOWN:,} more, see poses.json")
+    return "\n".join(lines)

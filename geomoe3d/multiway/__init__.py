@@ -1,0 +1,1 @@
+"""Many scans to one model: pairs proposed and registered, wrong edges rejected, poses optimised together."""

@@ -1,0 +1,119 @@
+"""An edge of the graph of scans: one registered pair, with what it measures and how much it is worth.
+
+Poses are T_group_scan in local coordinates (each scan's file coordinates minus its float64 origin), so that
+georeferenced scans lose nothing. Differences between motions are measured where they matter: as the root mean
+square distance by which they move the points of the source scan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from geomoe3d.batch.store import Outcome
+from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, shift_frames
+from geomoe3d.transform_files import has_transform
+from geomoe3d.types import FloatArray
+
+Verdict = Literal["kept", "rejected"]
+_MOST_LOG_ODDS = 7.0
+_LEAST_OBSERVABILITY = 1e-3  # directions weaker than this share of the strongest are held this much
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Where the points of a scan lie, in its local frame: enough to tell how far a motion moves them.
+
+    Attributes:
+        center: (3,) mean.
+        spread: (3, 3) covariance.
+        origin: (3,) file coordinate = local + origin.
+    """
+
+    center: FloatArray
+    spread: FloatArray
+    origin: FloatArray
+
+    @classmethod
+    def of(cls, points: FloatArray, origin: FloatArray) -> Shape:
+        """From the voxel points of a scan (N, 3), N >= 1."""
+        return cls(points.mean(0), np.atleast_2d(np.cov(points.T, bias=True)), origin)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A registered pair of scans, by number.
+
+    Attributes:
+        source, target: numbers of the scans.
+        T_target_source: (4, 4) in local coordinates.
+        confidence: of the registration.
+        information: (6, 6) about the target's local origin, order [rotation, translation], for the left
+            perturbation; scaled so that its translation part counts matched points.
+    """
+
+    source: int
+    target: int
+    T_target_source: FloatArray
+    confidence: float
+    information: FloatArray
+
+    @property
+    def worth(self) -> float:
+        """Log-odds of the confidence, at most 7: one edge alone never counts as certain."""
+        odds = np.clip(self.confidence, 1e-9, 1 - 1e-9)
+        return float(min(np.log(odds / (1 - odds)), _MOST_LOG_ODDS))
+
+
+def edge_of(outcome: Outcome, source: int, target: int, shapes: list[Shape]) -> Edge | None:
+    """The edge of a finished pair, or None where it holds no motion."""
+    result = outcome.result
+    if result is None or not has_transform(result) or not np.isfinite(result.information_matrix).all():
+        return None
+    origin = shapes[target].origin
+    T = shift_frames(result.T_target_source, -shapes[source].origin, -origin)
+    matched = max(result.overlap * result.source.num_points, 1.0)
+    information = _about_origin(result.information_matrix, result.information_center - origin)
+    information *= matched / max(float(np.trace(result.information_matrix[3:, 3:])), 1e-12)
+    # A surface that lets the source slide must not make the graph singular.
+    floor = _LEAST_OBSERVABILITY * matched
+    radius_squared = max(float(np.trace(shapes[source].spread)), 1e-12)
+    information += floor * np.diag([radius_squared] * 3 + [1.0] * 3)
+    return Edge(source, target, T, result.confidence, information)
+
+
+def displacement(T_a: FloatArray, T_b: FloatArray, shape: Shape) -> float:
+    """Root mean square distance between the images of a scan under two motions, cloud units."""
+    D = T_a - T_b
+    at_center = D[:3, :3] @ shape.center + D[:3, 3]
+    return float(np.sqrt(at_center @ at_center + np.trace(D[:3, :3] @ shape.spread @ D[:3, :3].T)))
+
+
+def agrees(T_a: FloatArray, T_b: FloatArray, shape: Shape, tolerance: float, max_turn_deg: float) -> bool:
+    """Whether two motions of one scan are the same: in where they put its points, and in how they turn it.
+
+    The turn counts by itself, since a small overlap lets a scan turn about what it shares.
+    """
+    if displacement(T_a, T_b, shape) >= tolerance:
+        return False
+    return rotation_angle_deg(T_a[:3, :3].T @ T_b[:3, :3]) < max_turn_deg
+
+
+def predicted_motion(source: int, target: int, poses: dict[int, FloatArray]) -> FloatArray:
+    """T_target_source (4, 4) by the poses T_group_scan."""
+    T: FloatArray = inverse(poses[target]) @ poses[source]
+    return T
+
+
+def _about_origin(information: FloatArray, center: FloatArray) -> FloatArray:
+    """Information about ``center`` as information about the origin of the same frame.
+
+    p + w x (p - c) + v = p + w x p + (v - w x c), so the perturbation about c is v = v_0 - c x w.
+    """
+    x, y, z = center
+    A = np.eye(6)
+    A[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    moved: FloatArray = A.T @ information @ A
+    return moved

@@ -1,0 +1,84 @@
+"""Poses and graphs in the formats that other tools read: TUM, KITTI and g2o text.
+
+TUM and KITTI hold T_reference_scan in file coordinates: p_reference = R p_scan + t. g2o holds local
+coordinates (file coordinates minus each scan's origin), because its consumers compute with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from geomoe3d.multiway.edges import Edge
+from geomoe3d.types import FloatArray
+
+
+def tum_text(names: Sequence[str], numbers: Sequence[int], poses: Sequence[FloatArray]) -> str:
+    """``number tx ty tz qx qy qz qw`` per scan; in place of a time, the scan's place in the input."""
+    lines = ["# scan tx ty tz qx qy qz qw   (p_reference = R p_scan + t)"]
+    for name, number, T in zip(names, numbers, poses, strict=True):
+        values = " ".join(f"{value:.17g}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))
+        lines += [f"# {' '.join(name.split())}", f"{number} {values}"]
+    return "\n".join(lines) + "\n"
+
+
+def kitti_text(poses: Sequence[FloatArray]) -> str:
+    """The upper three rows of every pose in one line, in the order of the scans."""
+    return "".join(" ".join(f"{value:.17g}" for value in T[:3].ravel()) + "\n" for T in poses)
+
+
+def g2o_text(poses: dict[int, FloatArray], edges: Sequence[Edge]) -> str:
+    """``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines; the first vertex is fixed.
+
+    An edge i j of g2o measures X_i^-1 X_j, which is T_target_source with i the target and j the source. Its
+    information belongs to a small motion on the right, [translation, vector part of the quaternion].
+    """
+    lines = []
+    for scan in sorted(poses):
+        T = poses[scan]
+        lines.append(f"VERTEX_SE3:QUAT {scan} {_seven(T)}")
+    lines.append(f"FIX {min(poses)}")
+    for edge in edges:
+        information = right_information(edge)
+        upper = " ".join(f"{information[r, c]:.10g}" for r in range(6) for c in range(r, 6))
+        lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {_seven(edge.T_target_source)} {upper}")
+    return "\n".join(lines) + "\n"
+
+
+def right_information(edge: Edge) -> FloatArray:
+    """(6, 6) information of an edge as g2o takes it: order [translation, half turn], motion on the right.
+
+    A small motion x on the right of T equals Ad(T) x on its left.
+    """
+    R, t = edge.T_target_source[:3, :3], edge.T_target_source[:3, 3]
+    across = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    adjoint = np.zeros((6, 6))  # order [rotation, translation]
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[3:, :3] = across @ R
+    adjoint[:, :3] *= 2.0  # the vector part of a quaternion is half the turn
+    order = [3, 4, 5, 0, 1, 2]
+    information = adjoint.T @ edge.information @ adjoint
+    ordered: FloatArray = information[np.ix_(order, order)]
+    return ordered
+
+
+def quaternion(R: FloatArray) -> FloatArray:
+    """Unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3)."""
+    a, b, c, d, e, f, g, h, i = R.ravel()
+    squares = np.array([1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i])
+    rows = np.array(
+        [
+            [squares[0], b + d, c + g, h - f],
+            [b + d, squares[1], f + h, c - g],
+            [c + g, f + h, squares[2], d - b],
+            [h - f, c - g, d - b, squares[3]],
+        ]
+    )
+    q: FloatArray = rows[int(squares.argmax())]  # the best conditioned of the four formulas
+    q = q / np.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def _seven(T: FloatArray) -> str:
+    return " ".join(f"{value:.17g}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))

@@ -1,0 +1,46 @@
+"""How much two scans overlap under given poses, from a few hundred points of each."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.types import FloatArray
+
+_SAMPLE = 400
+
+
+class Overlaps:
+    """Predicts overlaps; some 0.2 ms each.
+
+    Args:
+        points: (N, 3) voxel points by scan, local coordinates.
+        seed: decides the sample.
+    """
+
+    def __init__(self, points: dict[int, FloatArray], *, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self._points = {k: p[rng.permutation(len(p))[:_SAMPLE]] for k, p in points.items()}
+        self._tree = lru_cache(maxsize=None)(self._build)
+
+    def of(self, source: int, target: int, T_target_source: FloatArray) -> float:
+        """Share of the source's sample that lies among the target's; 0 for a scan that is not known."""
+        if source not in self._points or target not in self._points:
+            return 0.0
+        tree, reach = self._tree(target)
+        moved = transform_points(T_target_source, self._points[source])
+        distance, _ = tree.query(moved, distance_upper_bound=reach)
+        return float(np.isfinite(distance).mean())
+
+    def _build(self, scan: int) -> tuple[Any, float]:
+        from scipy.spatial import cKDTree
+
+        points = self._points[scan]
+        tree = cKDTree(points)
+        if len(points) < 2:
+            return tree, 0.0
+        # A thinned surface has holes of the size of its points' distances.
+        return tree, 1.5 * float(np.median(np.asarray(tree.query(points, k=2)[0])[:, 1]))

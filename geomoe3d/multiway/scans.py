@@ -1,0 +1,108 @@
+"""The scans of a model: which files, under which names, in which order, on which common voxel grid."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
+from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size
+from geomoe3d.config import PreparationConfig
+from geomoe3d.errors import GeoMoE3DError, InputError
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One file of the model.
+
+    Attributes:
+        name: unique in the model; the file's stem, with as much of its folder as makes it unique.
+        path: absolute.
+    """
+
+    name: str
+    path: str
+
+
+def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
+    """The scans of given files and folders, in natural order (scan 2 before scan 10) within each folder.
+
+    A folder stands for all files in it that can be read as clouds, not for its sub-folders.
+
+    Raises:
+        InputError: a path that is not there, a folder without clouds, a file given twice, or fewer than two.
+    """
+    paths: list[Path] = []
+    for given in inputs:
+        path = Path(given)
+        if path.is_dir():
+            inside = [p for p in path.iterdir() if p.suffix.lower() in READABLE_SUFFIXES and p.is_file()]
+            if not inside:
+                raise InputError(f"'{path}' holds no clouds; readable are {', '.join(READABLE_SUFFIXES)}")
+            paths += sorted(inside, key=lambda p: natural_key(p.name))
+        elif path.is_file():
+            paths.append(path)
+        else:
+            raise InputError(f"there is no file or folder '{path}' (folder now: {Path.cwd()})")
+    resolved = [path.resolve() for path in paths]
+    twice = {path for path in resolved if resolved.count(path) > 1}
+    if twice:
+        raise InputError(f"'{sorted(twice)[0]}' is given more than once; name every scan once")
+    if len(resolved) < 2:
+        raise InputError(f"a model needs at least 2 scans, found {len(resolved)}")
+    return [Scan(name, str(path)) for name, path in zip(_unique_names(resolved), resolved, strict=True)]
+
+
+def choose_common_voxel_size(
+    scans: Iterable[Scan], config: PreparationConfig, progress: Callable[[int, int], None] | None = None
+) -> tuple[float, dict[str, str]]:
+    """One voxel size for all scans, and the scans that cannot be used, with the reason.
+
+    It is the median of what each scan would get by itself, rounded to two digits, and raised where a scan
+    would occupy more than ``config.max_points`` voxels.
+
+    Raises:
+        InputError: fewer than two scans can be used.
+    """
+    sizes: dict[str, float] = {}
+    unusable: dict[str, str] = {}
+    for number, scan in enumerate(scans := list(scans)):
+        try:
+            cloud = load_points(scan.path)
+            check_cloud(cloud)
+            sizes[scan.path] = choose_voxel_size(cloud, cloud, config.voxel_points)
+        except GeoMoE3DError as error:
+            unusable[scan.name] = str(error)
+        if progress is not None:
+            progress(number + 1, len(scans))
+    if len(sizes) < 2:
+        listed = "; ".join(f"{name}: {reason}" for name, reason in unusable.items())
+        raise InputError(f"fewer than 2 scans can be used: {listed}")
+    common = float(np.median(list(sizes.values())))
+    for path, size in sizes.items():
+        if size > 2 * common:  # only such a scan can occupy too many voxels
+            cloud = load_points(path)
+            common = bounded_voxel_size(cloud, cloud, common, config.max_points)
+    return float(f"{common:.2g}"), unusable
+
+
+def natural_key(text: str) -> list[tuple[int, int, str]]:
+    """A key by which scan 2 comes before scan 10."""
+    return [
+        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part
+    ]
+
+
+def _unique_names(paths: list[Path]) -> list[str]:
+    for depth in range(1, max(len(path.parts) for path in paths) + 1):
+        names = [
+            "/".join((*path.parent.parts[len(path.parent.parts) - depth + 1 :], path.stem)) for path in paths
+        ]
+        if len(set(names)) == len(names):
+            return names
+    return [str(path) for path in paths]  # two files that differ in their suffix alone

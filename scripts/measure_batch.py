@@ -5,7 +5,7 @@
 Pairs are of generated scans (boxes turned every way), about 3,000 points each, 0.12 voxels: 0.1 to 0.2 s of
 one core. The first part runs the command with two workers and kills one of them after every 50 pairs; in the
 end every pair must be in the journal once, and results.jsonl must hold the bytes of a run in which nobody
-dies. The second part measures pairs per minute with 1 and with 2 workers, descriptions kept from the run before.
+dies. The second part measures pairs per minute with 1 and with 2 workers, descriptions being kept already.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ install_browser() {
 }
 
 set_up
-install_package dev,las,e57,train
+install_package dev,las,e57,train,dask,peers
 install_browser
 
 cd "$checkout"

@@ -118,7 +118,7 @@
     const width = Math.max(1, Math.round(stage.clientWidth * ratio)), height = Math.max(1, Math.round(stage.clientHeight * ratio));
     const shown = Object.keys(clouds).filter((name) => !state.hidden.has(name)), background = ground();
     renderer.draw({ ...cameraMatrices(width, height), model: STILL, clouds: shown.map((name) => ({ name, model: STILL })),
-      classes: state.classes, background, diameter: 1.5 * data.spacing * 2 ** state.size }, width, height, ratio);
+      classes: state.classes, background, diameter: 0.8 * data.spacing * 2 ** state.size }, width, height, ratio);
     const num = shown.reduce((sum, name) => sum + clouds[name].points.length / 3, 0);
     if (!checked) {
       checked = true;

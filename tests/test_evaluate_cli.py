@@ -76,7 +76,7 @@ def test_scores_of_known_methods(study: Path, capsys: pytest.CaptureFixture[str]
     runs = {found["info"]["label"]: found for found in json.loads((tmp_path / "r.json").read_text())["runs"]}
     assert runs["right"]["measures"]["recall_15"]["value"] == 100
     assert runs["silent"]["measures"]["recall_15"]["value"] == 0
-    assert runs["right"]["info"]["command"].startswith("geomoe3d ")
+    assert runs["right"]["info"]["command"].startswith("geomoe3d evaluate predict ")
     assert "100.0" in (tmp_path / "r.md").read_text()
 
 

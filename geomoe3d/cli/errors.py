@@ -7,6 +7,7 @@ not sure of the answer; 130 interrupted; 141 the reader of stdout went away (as 
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ HELP = {"help_option_names": ["-h", "--help"]}
 """Click's settings of every command."""
 
 _TRACEBACK = "geomoe3d.traceback"
+_COMMAND = "geomoe3d.command"
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -39,10 +41,14 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
         from click.shell_completion import shell_complete
 
         return shell_complete(command, {}, name, f"_{name.upper()}_COMPLETE", completing)
-    wanted = {_TRACEBACK: os.environ.get("GEOMOE3D_TRACEBACK", "") not in ("", "0")}
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    wanted: dict[str, Any] = {
+        _TRACEBACK: os.environ.get("GEOMOE3D_TRACEBACK", "") not in ("", "0"),
+        _COMMAND: shlex.join([name, *words]),
+    }
     try:
         try:
-            context = command.make_context(name, list(sys.argv[1:] if arguments is None else arguments))
+            context = command.make_context(name, list(words))
             context.meta.update({**wanted, **context.meta})
             wanted = context.meta  # shared with the contexts of the verbs
             with context:
@@ -66,6 +72,11 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
         if wanted[_TRACEBACK]:
             traceback.print_exc()
         return _explain(error, bool(wanted[_TRACEBACK]))
+
+
+def command_line() -> str:
+    """The command at work as the user typed it, for the record in what it writes."""
+    return str(click.get_current_context().meta[_COMMAND])
 
 
 def _explain(error: Exception, shown: bool) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
+from geomoe3d.cli.errors import BAD_INPUT, HELP, command_line, traceback_option
 
 if TYPE_CHECKING:
     from geomoe3d.evaluation.study import StudiedRun
@@ -194,7 +193,7 @@ def _predict(
         task = Task(benchmark, track, root, every, num_unrelated, seed)
         with stdout_to_stderr(), progress_bar("predictions", quiet=False) as advance:
             report = predict(
-                study, specs, task, workers=workers, fresh=fresh, command=_command_line(), progress=advance
+                study, specs, task, workers=workers, fresh=fresh, command=command_line(), progress=advance
             )
         for name, reason in report.absent.items():
             click.echo(f"absent: {name}: {reason}", err=True)
@@ -220,7 +219,3 @@ def _print_table(runs: list[StudiedRun]) -> None:
     width = shutil.get_terminal_size((0, 0)).columns or None
     color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     click.echo(terminal_table([run.score for run in runs], width=width, color=color))
-
-
-def _command_line() -> str:
-    return shlex.join(["geomoe3d", *sys.argv[1:]])

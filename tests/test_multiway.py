@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from small_scans import SETTINGS, cut, scene
 from geomoe3d import register_scans
 from geomoe3d.batch.store import JOURNAL_FILE
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig, load_config
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import (
@@ -27,18 +29,20 @@ from geomoe3d.geometry.se3 import (
     transform_points,
 )
 from geomoe3d.journal import read_journal
+from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.edges import Edge, Shape, agrees, displacement
 from geomoe3d.multiway.formats import quaternion, right_information
-from geomoe3d.multiway.grouping import GroupingRules, connected_parts, group_scans, settle
+from geomoe3d.multiway.grouping import Group, GroupingRules, connected_parts, group_scans, settle
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.page import render_model_page
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.proposals import propose_pairs, scan_similarity
 from geomoe3d.multiway.scans import choose_common_voxel_size, find_scans
+from geomoe3d.types import PointCloud
 
 CONFIG = load_config(None, SETTINGS)
 UTM = np.array([583394.0, 5283100.0, 498.0])
-RULES = GroupingRules(tolerance=0.2, kept_tolerance=0.125)
+RULES = GroupingRules(tolerance=0.2, near_tolerance=0.125, kept_tolerance=0.125)
 CUTS = ((0.0, 2.6), (0.5, 3.1), (1.0, 3.6), (1.4, 4.0), (1.8, 4.6))
 
 
@@ -229,6 +233,34 @@ def test_unusable_input_is_refused(tmp_path, monkeypatch, inputs, named, message
         register_scans(inputs, tmp_path / "out", config=CONFIG, **named)
 
 
+def test_a_folder_that_holds_something_of_the_users_is_refused(room, tmp_path):
+    scans, _ = room
+    out = tmp_path / "out"
+    out.mkdir()
+    kept = [out / "group1.ply", out / "groups.csv"]
+    for path in kept:
+        path.write_text("mine")
+    with pytest.raises(InputError, match=r"group1\.ply' is not of a model"):
+        register_scans([scans], out, config=CONFIG)
+    with pytest.raises(InputError, match="is a file"):
+        register_scans([scans], kept[1], config=CONFIG)
+    with pytest.raises(InputError, match="taken for a scan"):
+        register_scans([scans], scans, config=CONFIG)
+    assert sorted(out.iterdir()) == kept
+    assert all(path.read_text() == "mine" for path in kept)
+
+
+def test_files_of_the_users_beside_a_model_stay(room, tmp_path):
+    scans = [room[0] / f"scan_{k}.npy" for k in (0, 1)]
+    (tmp_path / "grouping.txt").write_text("mine")
+    register_scans(scans, tmp_path, config=CONFIG, page=False)
+    (tmp_path / "group7.ply").write_bytes((tmp_path / "group1.ply").read_bytes())  # of a larger model before
+    register_scans(scans, tmp_path, config=CONFIG, page=False)
+    assert (tmp_path / "grouping.txt").read_text() == "mine"
+    assert (tmp_path / "group1.ply").is_file()
+    assert not (tmp_path / "group7.ply").exists()
+
+
 # ---- parts -------------------------------------------------------------------------------------------
 
 
@@ -320,6 +352,71 @@ def test_wrong_edges_are_rejected_however_confident():
     assert not kept & {id(e) for e in wrong}
 
 
+def test_an_edge_that_the_aligned_surfaces_contradict_is_not_kept():
+    shapes, truth, edges, rng = graph(noise=0.002)
+    bent = inverse(truth[0]) @ truth[4]
+    bent[:3, 3] += [0.1, 0, 0]  # near enough for the pose graph, not for what the surfaces say
+    edges = [*edges, edge(4, 0, bent, 0.9999, rng)]
+    poses = dict(truth)
+    rules = replace(RULES, kept_tolerance=0.06)
+    (group,) = settle(Group(poses, list(edges)), edges, shapes, rules, lambda poses: dict(truth))
+    assert {id(e) for e in group.edges} == {id(e) for e in edges[:-1]}
+    assert largest_error(group.poses, truth) < 1e-12
+    # A scan that hung on such an edge alone is let go.
+    alone = [e for e in edges[:-1] if 4 not in (e.source, e.target)]
+    groups = settle(
+        Group(poses, []), [*alone, edges[-1]], shapes, rules, lambda poses: {k: truth[k] for k in poses}
+    )
+    assert [sorted(group.poses) for group in groups] == [[0, 1, 2, 3, 5, 6, 7], [4]]
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    """Six scans of one scene as surfaces, and one of another scene; true poses."""
+    points, truth, made = scene(3), {}, {}
+    for k, (low, high) in enumerate([*CUTS, (2.0, 4.4)]):
+        part, truth[k] = cut(points, low, high, seed=20 + k)
+        cloud = prepare(PointCloud(part), 0.12, CONFIG.preparation, viewpoint=None, seed=0)
+        made[k] = Surface(cloud.points, cloud.normals, signed=False)
+    elsewhere = prepare(PointCloud(scene(5) + 50), 0.12, CONFIG.preparation, viewpoint=None, seed=0)
+    made[6], truth[6] = Surface(elsewhere.points, elsewhere.normals, signed=False), np.eye(4)
+    return made, truth, Overlaps({k: s.points for k, s in made.items()})
+
+
+def moved_about(truth, rng, turn=0.02, shift=0.1):
+    poses = {}
+    for k, T in truth.items():
+        R = Rotation.from_rotvec(turn * rng.normal(size=3)).as_matrix()
+        poses[k] = T @ make_transform(R, shift * rng.normal(size=3))
+    return poses
+
+
+def test_surfaces_draw_scans_into_place(surfaces):
+    made, truth, overlaps = surfaces
+    start = moved_about({k: truth[k] for k in range(6)}, np.random.default_rng(1))
+    found = align_scans(start, made, overlaps, 0.12)
+    assert np.abs(found[0] - start[0]).max() < 1e-12
+    assert largest_error(start, truth) > 0.15
+    assert largest_error(found, truth) < 0.03
+    for T in found.values():
+        assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-12
+    # The frame of the group changes nothing: it may lie far away and be turned.
+    away = make_transform(Rotation.random(random_state=9).as_matrix(), np.array([300.0, -40.0, 7.0]))
+    far = align_scans({k: away @ T for k, T in start.items()}, made, overlaps, 0.12)
+    assert max(np.abs(inverse(away) @ far[k] - found[k]).max() for k in found) < 1e-6
+
+
+def test_a_scan_that_overlaps_nothing_stays_where_it_was(surfaces):
+    made, truth, overlaps = surfaces
+    start = {0: truth[0], 6: truth[6]}
+    found = align_scans(start, made, overlaps, 0.12)
+    assert all(np.abs(found[k] - start[k]).max() < 1e-12 for k in start)
+    one = align_scans({3: truth[3]}, made, overlaps, 0.12)
+    assert np.abs(one[3] - truth[3]).max() < 1e-12
+    among = align_scans(moved_about(truth, np.random.default_rng(2), 0.01, 0.05), made, overlaps, 0.12)
+    assert largest_error({k: among[k] for k in range(6)}, truth) < 0.03
+
+
 def test_two_motions_that_compete_keep_groups_apart():
     shapes, truth, _, rng = graph(count=2)
     right = inverse(truth[0]) @ truth[1]
@@ -341,8 +438,31 @@ def test_one_doubtful_edge_is_not_enough_and_silent_pairs_speak_against_it():
     assert overlaps.of(2, 1, inverse(truth[1]) @ truth[2]) > 0.9
     assert overlaps.of(2, 1, np.eye(4) + np.eye(4)[:, [3, 3, 3, 3]] * 0) < 0.9
     tried = {(0, 1), (0, 2), (1, 2)}
-    strict = GroupingRules(tolerance=0.2, kept_tolerance=0.125, silent_worth=20.0)
+    strict = GroupingRules(tolerance=0.2, near_tolerance=0.125, kept_tolerance=0.125, silent_worth=20.0)
     assert [len(g.poses) for g in group_scans(shapes, sure, strict, tried, overlaps)] == [2, 1]
+
+
+def test_groups_are_gone_on_with():
+    shapes, truth, edges, _ = graph()
+    halves = [group_scans(shapes, [e for e in edges if side(e)], RULES) for side in (lower, upper)]
+    start = [
+        group for half, size in zip(halves, (4, 4), strict=True) for group in half if len(group.poses) == size
+    ]
+    assert [sorted(group.poses) for group in start] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    (group,) = group_scans(shapes, edges, RULES, start=start)
+    assert largest_error(group.poses, truth) < 0.1
+    assert [sorted(g.poses) for g in group_scans(shapes, [], RULES, start=start)] == [
+        [0, 1, 2, 3],
+        [4, 5, 6, 7],
+    ]
+
+
+def lower(edge):
+    return edge.source < 4 and edge.target < 4
+
+
+def upper(edge):
+    return edge.source >= 4 and edge.target >= 4
 
 
 def test_parts_without_edges_between_them_stay_apart():

@@ -75,6 +75,8 @@ class BatchStore:
         identity = {"format": _FORMAT, **self._shared, "weights": _weights_hash(config)}
         try:
             folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise OutputError(f"'{folder}' is a file; results are written into a folder") from None
         except OSError as error:
             raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
         path = folder / RUN_FILE

@@ -19,7 +19,12 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.command(context_settings=HELP, short_help="Register many pairs, resumably, on one machine or more.")
 @click.argument("pairs", metavar="PAIRS.csv")
 @click.argument("out", metavar="OUT")
-@click.option("--workers", type=int, metavar="N", help="Local processes. [as many as cores and memory allow]")
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Local processes. [as many as cores and memory allow]",
+)
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask scheduler instead.")
 @click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid, in the clouds' unit. [chosen]")
 @click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
@@ -92,7 +97,7 @@ def table(report: BatchReport) -> str:
     """Counts by status, then the pairs that are not ok, the least sure first."""
     total = len(report.outcomes)
     before = f", {report.kept:,} of them before" if report.kept else ""
-    lines = [f"{total:,} pairs{before}; results in {report.folder / 'results.jsonl'}", ""]
+    lines = [f"{total:,} pair{'s' * (total != 1)}{before}; results in {report.folder / 'results.jsonl'}", ""]
     for status, count in report.counts().items():
         word = status.replace("_", " ") if status != "error" else "not registered"
         lines.append(f"  {click.style(word, fg=_COLORS[status]):24} {count:>7,}  {count / total:6.1%}")

@@ -21,12 +21,28 @@ _SHOWN = 20
     "--pairs", metavar="WHICH", default="auto", help="all, similar, or auto: all for up to 30 scans."
 )
 @click.option(
-    "--neighbors", type=int, default=10, metavar="N", help="Pairs proposed per scan and round. [10]"
+    "--neighbors",
+    type=click.IntRange(1),
+    default=10,
+    metavar="N",
+    help="Pairs proposed per scan and round. [10]",
 )
 @click.option(
     "--model-voxel-size", type=float, metavar="LENGTH", help="Of the merged cloud. [that of the scans]"
 )
-@click.option("--workers", type=int, metavar="N", help="Local processes. [as many as cores and memory allow]")
+@click.option(
+    "--rounds",
+    type=click.IntRange(0),
+    default=3,
+    metavar="N",
+    help="Of further pairs, where scans are loose. [3]",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Local processes. [as many as cores and memory allow]",
+)
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask scheduler instead.")
 @click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid of all scans. [chosen]")
 @click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
@@ -43,6 +59,7 @@ def command(
     inputs: tuple[str, ...],
     pairs: str,
     neighbors: int,
+    rounds: int,
     model_voxel_size: float | None,
     workers: int | None,
     scheduler: str | None,
@@ -82,6 +99,7 @@ def command(
             config=config,
             pairs=pairs,
             neighbors=neighbors,
+            rounds=rounds,
             merged_voxel_size=model_voxel_size,
             page=not no_page,
             workers=ALL_THAT_FIT if workers is None and scheduler is None else workers,

@@ -9,7 +9,7 @@ these are found to disagree with the poses and rejected. Cost: some milliseconds
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,6 +32,8 @@ class GroupingRules:
         joined_worth: log-odds that the winning motion must collect (6: one confidence of 0.9975, or several).
         tolerance: largest displacement of motions that agree when groups are joined, cloud units.
         turn_deg: their largest turn.
+        near_tolerance: largest displacement from the poses of an edge over which they are optimised.
+        near_turn_deg: its largest turn from them.
         kept_tolerance: largest displacement of a kept edge from the final poses, cloud units.
         kept_turn_deg: its largest turn from them.
         further_share: of the log-odds of all supporters but the surest, since they are not independent.
@@ -40,9 +42,11 @@ class GroupingRules:
     """
 
     tolerance: float
+    near_tolerance: float
     kept_tolerance: float
     turn_deg: float = 8.0
-    kept_turn_deg: float = 5.0
+    near_turn_deg: float = 5.0
+    kept_turn_deg: float = 3.0
     further_share: float = 0.5
     silent_overlap: float = 0.5
     silent_worth: float = 2.0
@@ -83,6 +87,7 @@ def group_scans(
     rules: GroupingRules,
     tried: Collection[tuple[int, int]] = (),
     overlaps: Overlaps | None = None,
+    start: Sequence[Group] | None = None,
 ) -> list[Group]:
     """Groups of scans, the largest first; a scan that nothing sure ties to another is a group of its own.
 
@@ -92,16 +97,22 @@ def group_scans(
         rules: thresholds.
         tried: pairs (smaller, larger number) that were registered, whatever came of it.
         overlaps: predicts how much two scans overlap; None takes no account of pairs that are silent.
+        start: groups to begin with, every scan in one of them; None: every scan by itself.
     """
     shapes = list(shapes)
     voices = [edge for edge in edges if edge.worth > rules.least_worth]
-    groups: dict[int, Group] = {k: Group({k: np.eye(4)}) for k in range(len(shapes))}
-    member = list(range(len(shapes)))
+    alone = [Group({k: np.eye(4)}) for k in range(len(shapes))]
+    groups = {min(group.poses): group for group in (alone if start is None else start)}
+    member = [0] * len(shapes)
+    for number, group in groups.items():
+        for scan in group.poses:
+            member[scan] = number
     votes: dict[tuple[int, int], Vote | None] = {}
     heard: set[tuple[int, int]] = set()  # votes from which silent pairs have been taken off
     between: dict[tuple[int, int], list[Edge]] = {}
     for edge in voices:
-        between.setdefault(_pair(member[edge.source], member[edge.target]), []).append(edge)
+        if member[edge.source] != member[edge.target]:
+            between.setdefault(_pair(member[edge.source], member[edge.target]), []).append(edge)
     while True:
         for key, crossing in between.items():
             if key not in votes:
@@ -223,8 +234,25 @@ def _join(a: Group, b: Group, vote: Vote, shapes: list[Shape], rules: GroupingRu
     return Group(poses, edges)
 
 
-def settle(group: Group, edges: Sequence[Edge], shapes: Sequence[Shape], rules: GroupingRules) -> list[Group]:
-    """The group held by the edges that agree closely with its poses, optimised until no edge comes or goes.
+def settle(
+    group: Group,
+    edges: Sequence[Edge],
+    shapes: Sequence[Shape],
+    rules: GroupingRules,
+    align: Callable[[dict[int, FloatArray]], dict[int, FloatArray]] | None = None,
+) -> list[Group]:
+    """The group held by the edges that agree closely with its final poses.
+
+    Poses are optimised over the edges near them until none comes or goes, and then laid on each other by
+    their surfaces. An edge is kept where it agrees with what came of that: surfaces that all agree show the
+    error of a single pair, which the pose graph would have spread among its neighbours.
+
+    Args:
+        group: from `group_scans`.
+        edges: of all registered pairs.
+        shapes: of all scans.
+        rules: thresholds.
+        align: poses to better poses, by the surfaces; None leaves them as the edges give them.
 
     Returns:
         One group, or several where only edges that do not agree closely held them together.
@@ -233,26 +261,55 @@ def settle(group: Group, edges: Sequence[Edge], shapes: Sequence[Shape], rules: 
     inside = [e for e in inside if e.worth > rules.least_worth]
     poses, kept = group.poses, group.edges
     for _ in range(_MOST_ROUNDS):
-        close = [
-            e
-            for e in inside
-            if agrees(
-                predicted_motion(e.source, e.target, poses),
-                e.T_target_source,
-                shapes[e.source],
-                rules.kept_tolerance,
-                rules.kept_turn_deg,
-            )
-        ]
-        if {id(e) for e in close} == {id(e) for e in kept}:
+        near = _agreeing(inside, poses, shapes, rules.near_tolerance, rules.near_turn_deg)
+        if {id(e) for e in near} == {id(e) for e in kept}:
             break
-        kept = close
+        kept = near
         parts = connected_parts(poses, kept)
         if len(parts) > 1:
-            groups = [Group({k: poses[k] for k in part}) for part in parts]
-            return [piece for part in groups for piece in settle(part, kept, shapes, rules)]
+            return _settled_apart(poses, parts, kept, shapes, rules, align)
         poses = optimise(poses, kept, rules.tolerance)
+    if align is not None and len(poses) > 1:
+        poses = align(poses)
+    kept = _agreeing(inside, poses, shapes, rules.kept_tolerance, rules.kept_turn_deg)
+    parts = connected_parts(poses, kept)
+    if len(parts) > 1:
+        return _settled_apart(poses, parts, kept, shapes, rules, align)
     return [Group(poses, kept)]
+
+
+def _settled_apart(
+    poses: dict[int, FloatArray],
+    parts: list[list[int]],
+    edges: Sequence[Edge],
+    shapes: Sequence[Shape],
+    rules: GroupingRules,
+    align: Callable[[dict[int, FloatArray]], dict[int, FloatArray]] | None,
+) -> list[Group]:
+    """Every part of a group settled by itself: what let go of it may have bent it."""
+    groups = [Group({k: poses[k] for k in part}) for part in parts]
+    return [piece for part in groups for piece in settle(part, edges, shapes, rules, align)]
+
+
+def _agreeing(
+    edges: Sequence[Edge],
+    poses: dict[int, FloatArray],
+    shapes: Sequence[Shape],
+    tolerance: float,
+    turn_deg: float,
+) -> list[Edge]:
+    """The edges that say what the poses say."""
+    return [
+        edge
+        for edge in edges
+        if agrees(
+            predicted_motion(edge.source, edge.target, poses),
+            edge.T_target_source,
+            shapes[edge.source],
+            tolerance,
+            turn_deg,
+        )
+    ]
 
 
 def connected_parts(scans: Iterable[int], edges: Sequence[Edge]) -> list[list[int]]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,16 @@ import numpy as np
 from geomoe3d.answer import library_versions
 from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.clouds.prepare import voxel_means
+from geomoe3d.errors import InputError
 from geomoe3d.files import write_atomically
 from geomoe3d.geometry.se3 import inverse, shift_frames, transform_points
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.formats import g2o_text, kitti_text, tum_text
 from geomoe3d.multiway.scans import Scan
 from geomoe3d.types import FloatArray
+
+POSES_FILE = "poses.json"
+_GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|g2o|ply)")
 
 
 @dataclass(frozen=True)
@@ -124,6 +130,30 @@ class SceneModel:
         return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
+def check_folder(folder: Path, inputs: Iterable[str | os.PathLike[str]]) -> None:
+    """Refuse a folder in which the model would overwrite, or next time be taken for, something of the user's.
+
+    Raises:
+        InputError: it is a file, one of the inputs, or holds files under the model's names but no model.
+    """
+    if folder.is_file():
+        raise InputError(f"'{folder}' is a file; the folder in which the model is written is named last")
+    if any(Path(given).is_dir() and folder.resolve() == Path(given).resolve() for given in inputs):
+        raise InputError(
+            f"'{folder}' is a folder of scans too: the merged cloud would be taken for a scan; give another"
+        )
+    strange = [] if (folder / POSES_FILE).exists() else _group_files(folder)
+    if strange:
+        raise InputError(
+            f"'{strange[0]}' is not of a model of geomoe3d and would be overwritten; give another folder"
+        )
+
+
+def _group_files(folder: Path) -> list[Path]:
+    """What `write_model` writes per group."""
+    return sorted(path for path in folder.glob("group*") if _GROUP_FILE.fullmatch(path.name))
+
+
 def file_poses(
     local: dict[int, FloatArray], scans: Sequence[Scan], origins: dict[int, FloatArray]
 ) -> tuple[str, dict[str, FloatArray]]:
@@ -145,8 +175,8 @@ def write_model(model: SceneModel, merged_voxel_size: float | None) -> None:
     """
     number = {scan.name: k for k, scan in enumerate(model.scans)}
     paths = {scan.name: scan.path for scan in model.scans}
-    write_text(model.folder / "poses.json", model.to_json())
-    for old in model.folder.glob("group*.*"):
+    write_text(model.folder / POSES_FILE, model.to_json())
+    for old in _group_files(model.folder):
         old.unlink()
     for count, group in enumerate(model.groups, start=1):
         names, poses = list(group.poses), list(group.poses.values())

@@ -25,9 +25,17 @@ from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.journal import read_journal
+from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.edges import Edge, Shape, agrees, edge_of, predicted_motion
 from geomoe3d.multiway.grouping import Group, GroupingRules, group_scans, settle
-from geomoe3d.multiway.model import EdgeReport, SceneGroup, SceneModel, file_poses, write_model
+from geomoe3d.multiway.model import (
+    EdgeReport,
+    SceneGroup,
+    SceneModel,
+    check_folder,
+    file_poses,
+    write_model,
+)
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.proposals import scan_similarity
 from geomoe3d.multiway.scans import Scan, choose_common_voxel_size, find_scans, natural_key
@@ -38,8 +46,10 @@ from geomoe3d.types import Float32Array, FloatArray
 ALL_PAIRS_UP_TO = 30
 NEIGHBORS = 10
 MOST_ROUNDS = 3
+_MOST_SETTLINGS = 3
 _TOLERANCE = 4.0  # voxels; see GroupingRules
-_KEPT_TOLERANCE = 2.5
+_NEAR_TOLERANCE = 2.5
+_KEPT_TOLERANCE = 1.5
 _CLOSING_OVERLAP = 0.3
 _CLOSING_PER_SCAN = 1
 
@@ -84,14 +94,16 @@ def register_scans(
         say: called with sentences on what begins.
 
     Raises:
-        InputError: fewer than two usable scans, an unknown choice of pairs, or a folder with pairs of another
-            configuration.
+        InputError: fewer than two usable scans, an unknown choice of pairs, or a folder that holds pairs of
+            another configuration, scans of this call, or files of the user's under the names of the model.
         OutputError: the folder cannot be written, or another process is writing it.
     """
     if pairs not in ("auto", "all", "similar"):
         raise InputError(f"pairs is '{pairs}'; choose auto, all or similar")
     if neighbors < 1:
         raise InputError(f"neighbors is {neighbors}, at least 1 pair per scan must be proposed")
+    scans = list(scans)
+    check_folder(Path(out), scans)
     say = say or (lambda text: None)
     clock = StageClock(say)
     found = find_scans(scans)
@@ -143,9 +155,11 @@ class _Room:
         self.scans, self.config, self.store, self.labour = scans, config, store, labour
         self.progress, self.say = progress, say
         self.voxel_size = float(config.voxel_size or 0.0)
-        self.rules = GroupingRules(_TOLERANCE * self.voxel_size, _KEPT_TOLERANCE * self.voxel_size)
+        tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE)
+        self.rules = GroupingRules(*(tolerance * self.voxel_size for tolerance in tolerances))
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
+        self.surfaces: dict[int, Surface] = {}
         self.overlaps = Overlaps({})
         self.similarity: FloatArray = np.zeros((0, 0))
         self.outcomes: dict[PairKey, Outcome] = {}
@@ -157,7 +171,6 @@ class _Room:
         """Every scan on the common grid: where its points lie, and how similar it is to the others."""
         registrar = Registrar(self.config, cache=open_cache(self.labour.cache))
         features: dict[int, Float32Array] = {}
-        points: dict[int, FloatArray] = {}
         nowhere = Shape(np.zeros(3), np.zeros((3, 3)), np.zeros(3))
         for number, scan in enumerate(self.scans):
             self.shapes.append(nowhere)
@@ -173,9 +186,10 @@ class _Room:
             assert described.features is not None
             features[number] = described.features
             self.shapes[number] = Shape.of(described.points, described.origin)
-            points[number] = described.points
+            self.surfaces[number] = Surface.of(described)
         if len(features) < 2:
             raise InputError(f"fewer than 2 scans can be used: {'; '.join(self.unusable.values())}")
+        points = {number: surface.points for number, surface in self.surfaces.items()}
         self.overlaps = Overlaps(points, seed=self.config.seed)
         self.similarity = np.full((len(self.scans), len(self.scans)), -np.inf)
         usable = list(features)
@@ -273,11 +287,28 @@ class _Room:
                 self.edges[pair] = edge
 
     def group(self) -> list[Group]:
-        """Groups by all edges so far; a scan that cannot be used is a group of its own."""
+        """Groups by all edges so far; a scan that cannot be used is a group of its own.
+
+        What settling lets go may find its place among scans that are better aligned now, so groups are joined
+        and settled again while that joins any.
+        """
         edges = [self.edges[key] for key in sorted(self.edges)]
-        groups = group_scans(self.shapes, edges, self.rules, self.outcomes.keys(), self.overlaps)
-        settled = [part for group in groups for part in settle(group, edges, self.shapes, self.rules)]
-        return sorted(settled, key=lambda group: (-len(group.poses), min(group.poses)))
+        groups: list[Group] | None = None
+        for _ in range(_MOST_SETTLINGS):
+            known = groups
+            groups = group_scans(self.shapes, edges, self.rules, self.outcomes.keys(), self.overlaps, known)
+            if known is not None and len(groups) == len(known):
+                break
+            groups = [part for group in groups for part in self.settle(group, edges)]
+        return sorted(groups or [], key=lambda group: (-len(group.poses), min(group.poses)))
+
+    def settle(self, group: Group, edges: list[Edge]) -> list[Group]:
+        """The group, or what is left of it, aligned and held by edges that agree closely."""
+        return settle(group, edges, self.shapes, self.rules, self.align)
+
+    def align(self, poses: dict[int, FloatArray]) -> dict[int, FloatArray]:
+        """The poses of a group laid on each other by the scans' surfaces."""
+        return align_scans(poses, self.surfaces, self.overlaps, self.voxel_size, seed=self.config.seed)
 
     # ---- the answer
 
@@ -347,10 +378,11 @@ class _Room:
             return f"none of its {tried} pairs gave a motion"
         edge, pair = max(mine, key=lambda item: item[0].confidence)
         other = self.scans[pair[0] if pair[1] == scan else pair[1]].name
-        return (
-            f"its surest of {tried} pairs, with '{other}', has confidence {edge.confidence:.2f}, and nothing "
-            "agrees with it: one pair must be surer, or two must agree"
-        )
+        surest = f"its surest of {tried} pairs, with '{other}', has confidence {edge.confidence:.3f}"
+        voices = sum(edge.worth > self.rules.least_worth for edge, _ in mine)
+        if voices > 1:
+            return f"{surest}, but its {voices} pairs above 0.5 do not agree on one place clearly enough"
+        return f"{surest}, and nothing agrees with it: one pair must be surer, or two must agree"
 
 
 def _with_voxel_size(

@@ -11,7 +11,7 @@ import difflib
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from geomoe3d.errors import ConfigError
 
@@ -92,6 +92,26 @@ class VerificationConfig(Section):
     enabled: bool = Field(True, description="without it the correspondences alone choose the answer")
 
 
+class SecondLookConfig(Section):
+    """More work on a pair whose first answer is not ok."""
+
+    grids: tuple[float, ...] = Field(
+        (1.5, 2.0),
+        description="coarser grids, in voxels, on which further hypotheses are sought when the first answer "
+        "is not ok; none: the first answer stands",
+    )
+    num_refined: int = Field(
+        3, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
+    )
+
+    @field_validator("grids")
+    @classmethod
+    def _check(cls, grids: tuple[float, ...]) -> tuple[float, ...]:
+        if any(grid <= 1 for grid in grids):
+            raise ValueError("a second look is on coarser grids: factors must be above 1")
+        return grids
+
+
 class RefinementConfig(Section):
     """Local refinement of the chosen hypothesis on the clouds."""
 
@@ -123,6 +143,7 @@ class RegistrationConfig(Section):
     filter: FilterConfig = FilterConfig()
     estimator: EstimatorConfig = EstimatorConfig()
     verification: VerificationConfig = VerificationConfig()
+    second_look: SecondLookConfig = SecondLookConfig()
     refinement: RefinementConfig = RefinementConfig()
     judgement: JudgementConfig = JudgementConfig()
 

@@ -56,6 +56,7 @@ REQUIRED_MODULES = {
     "matplotlib": "matplotlib>=3.8",
     "trimesh": "trimesh>=4.4",
     "small_gicp": "small_gicp>=1.0",
+    "threadpoolctl": "threadpoolctl>=3.1",
 }
 """Module to import, and what to ask pip for; torch and Open3D have checks of their own."""
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.answer import Findings, failed_result, finished_result
+from geomoe3d.answer import failed_result, finished_result
+from geomoe3d.choice import Chooser
 from geomoe3d.clouds.description_cache import DescriptionCache
 from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.io import load_points
@@ -24,19 +25,13 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.errors import InputError
+from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter
-from geomoe3d.geometry.se3 import check_motion, shift_frames
-from geomoe3d.judge import judge, lead_over, measure_information
-from geomoe3d.refine import refine
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
+from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
-from geomoe3d.verification import Evidence, Verifier, clearly_different
-
-_CLOSE_LEAD = 2.0
-_KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
 
 
 @dataclass(frozen=True)
@@ -62,14 +57,6 @@ class Explanation:
     def weights(self) -> FloatArray:
         """(K,) the filter's weights."""
         return self.weighed.weights
-
-
-class Refined(NamedTuple):
-    """A motion (4, 4) in local coordinates, what the clouds say of it, and what went wrong, if anything."""
-
-    T_target_source: FloatArray
-    evidence: Evidence
-    note: str | None
 
 
 class Registrar:
@@ -159,21 +146,17 @@ class Registrar:
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         threshold = config.estimator.inlier_threshold * voxel_size
         described = self.describe(*clouds, voxel_size, clock)
-        clock("match")
-        matched = match(*described, config.matching, seed=seed)
-        clock("weigh")
-        weighed = self._filter(matched, voxel_size=voxel_size, seed=seed)
-        clock("solve")
-        hypotheses = self.solve(matched, weighed.weights, threshold)
-        if initial is not None:
-            hypotheses += self.guesses(initial, described)
-        clock("verify")
-        verifier = Verifier(*described, threshold, seed=seed)
-        ranked = verifier.rank(hypotheses)
-        clock("refine")
-        answer = self.refine(self.choose(hypotheses, ranked), verifier, described)
-        clock("judge")
-        findings = self.judge(answer, ranked, verifier, described, threshold)
+        matched, weighed, hypotheses = self.propose(described, clock)
+        with single_blas_thread():
+            chooser = Chooser(described, threshold, config, clock)
+            chooser.consider(hypotheses)
+            if initial is not None:
+                chooser.consider_guess(initial)
+            findings = chooser.conclude()
+            if findings.judgement.status != "ok" and config.verification.enabled and config.second_look.grids:
+                for grid in config.second_look.grids:
+                    chooser.consider(self.propose_on_grid(grid * voxel_size, described, clock))
+                findings = chooser.conclude(config.second_look.num_refined)
         if voxel_size > wanted:
             findings = findings.with_note(
                 f"a voxel size of {wanted:.4g} gives more than {config.preparation.max_points} voxels; "
@@ -209,12 +192,34 @@ class Registrar:
             return make()
         return self._cache.fetch(cloud, voxel_size, viewpoint, config, seed=seed, make=make)
 
-    def guesses(self, initial: ArrayLike, described: tuple[PreparedCloud, PreparedCloud]) -> list[Hypothesis]:
-        """A user's first guess and its refinement as hypotheses among the others: verified, not trusted."""
-        source, target = described
-        T = shift_frames(check_motion(initial), -source.origin, -target.origin)
-        refined, _ = refine(T, source, target, self.config.refinement)
-        return [Hypothesis(motion, 0.0, 0) for motion in (T, refined)]
+    def propose(
+        self, described: tuple[PreparedCloud, PreparedCloud], clock: StageClock
+    ) -> tuple[Correspondences, FilterOutput, list[Hypothesis]]:
+        """Match, weigh and solve."""
+        config, voxel_size = self.config, described[0].voxel_size
+        clock("match")
+        matched = match(*described, config.matching, seed=config.seed)
+        clock("weigh")
+        weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
+        clock("solve")
+        threshold = config.estimator.inlier_threshold * voxel_size
+        return matched, weighed, self.solve(matched, weighed.weights, threshold)
+
+    def propose_on_grid(
+        self, voxel_size: float, described: tuple[PreparedCloud, PreparedCloud], clock: StageClock
+    ) -> list[Hypothesis]:
+        """Hypotheses from the same clouds on a coarser grid of this edge, where features see more.
+
+        None where a cloud is too small for the grid.
+        """
+        clouds = [PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in described]
+        views = [cloud.viewpoint for cloud in described]
+        try:
+            source = self.describe_cloud(clouds[0], voxel_size, views[0], clock)
+            target = self.describe_cloud(clouds[1], voxel_size, views[1], clock)
+        except EmptyCloudError:
+            return []
+        return self.propose((source, target), clock)[2]
 
     def solve(self, matched: Correspondences, weights: FloatArray, threshold: float) -> list[Hypothesis]:
         """Hypotheses from all weighted correspondences, and from the mutual ones alone.
@@ -231,56 +236,6 @@ class Registrar:
                 matched.points[rows], weights[rows], inlier_threshold=threshold, seed=seed
             )
         return found
-
-    def choose(
-        self, hypotheses: list[Hypothesis], ranked: list[tuple[Hypothesis, Evidence]]
-    ) -> FloatArray | None:
-        """The motion that the clouds, or without verification the correspondences, like best."""
-        if not ranked:
-            return None
-        best = ranked[0][0] if self.config.verification.enabled else hypotheses[0]
-        return best.T_target_source
-
-    def refine(
-        self,
-        T_target_source: FloatArray | None,
-        verifier: Verifier,
-        described: tuple[PreparedCloud, PreparedCloud],
-    ) -> Refined | None:
-        """The motion refined on the clouds, or as it was where that made them fit less well."""
-        if T_target_source is None:
-            return None
-        T, note = refine(T_target_source, *described, self.config.refinement)
-        before, after = verifier.evidence(T_target_source), verifier.evidence(T)
-        if after.score < _KEPT_EVIDENCE * before.score:
-            note = "refinement made the clouds fit less well; the unrefined motion is given"
-            return Refined(T_target_source, before, note)
-        return Refined(T, after, note)
-
-    def judge(
-        self,
-        answer: Refined | None,
-        ranked: list[tuple[Hypothesis, Evidence]],
-        verifier: Verifier,
-        described: tuple[PreparedCloud, PreparedCloud],
-        threshold: float,
-    ) -> Findings:
-        """What to say of the answer, beside the best clearly different motion."""
-        if answer is None:
-            return Findings.nothing("no motion brings three correspondences in general position together")
-        T = answer.T_target_source
-        other = clearly_different(ranked, T, described[0], 3 * threshold)
-        lead = lead_over(answer.evidence, other[1] if other else None)
-        if other is not None and lead < _CLOSE_LEAD:  # a fair race: the rival is refined too
-            rival = self.refine(other[0].T_target_source, verifier, described)
-            if rival is not None and rival.evidence.score > other[1].score:
-                moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
-                other = clearly_different([moved], T, described[0], 3 * threshold) or other
-                lead = lead_over(answer.evidence, other[1])
-        information = measure_information(T, *described, threshold)
-        judgement = judge(answer.evidence, lead, information, self.config.judgement)
-        findings = Findings(T, other[0] if other else None, lead, answer.evidence, information, judgement)
-        return findings if answer.note is None else findings.with_note(answer.note)
 
 
 def register(

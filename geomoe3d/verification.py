@@ -139,8 +139,26 @@ class Verifier:
 
     def rank(self, hypotheses: list[Hypothesis]) -> list[tuple[Hypothesis, Evidence]]:
         """Hypotheses with their evidence, best first; equal evidence keeps the given order."""
-        judged = [(hypothesis, self.evidence(hypothesis.T_target_source)) for hypothesis in hypotheses]
-        return sorted(judged, key=lambda pair: (-pair[1].score, -pair[1].distinctiveness))
+        return best_first([(h, self.evidence(h.T_target_source)) for h in hypotheses])
+
+
+def best_first(judged: list[tuple[Hypothesis, Evidence]]) -> list[tuple[Hypothesis, Evidence]]:
+    """The same, the largest score first; equal evidence keeps the given order."""
+    return sorted(judged, key=lambda pair: (-pair[1].score, -pair[1].distinctiveness))
+
+
+def distinct(
+    ranked: list[tuple[Hypothesis, Evidence]], source: PreparedCloud, max_shift: float, limit: int
+) -> list[Hypothesis]:
+    """The best hypotheses that are all different motions, at most ``limit``; see `clearly_different`."""
+    chosen: list[Hypothesis] = []
+    for hypothesis, evidence in ranked:
+        if len(chosen) == limit:
+            break
+        entry = [(hypothesis, evidence)]
+        if all(clearly_different(entry, c.T_target_source, source, max_shift) for c in chosen):
+            chosen.append(hypothesis)
+    return chosen
 
 
 def clearly_different(

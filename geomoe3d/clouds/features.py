@@ -1,16 +1,17 @@
 """FPFH features of prepared clouds, by Open3D.
 
-Place: describe. About 0.06 s for 5,000 points of an indoor scan on two cores; linear in the points.
+Place: describe. About 0.06 s for 5,000 points of an indoor scan on one core; linear in the points.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from geomoe3d.config import PreparationConfig
-from geomoe3d.types import PreparedCloud
+from geomoe3d.types import Float32Array, PreparedCloud
 
 
 def describe(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
@@ -24,13 +25,16 @@ def describe(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
     """
     import open3d as o3d
 
-    geometry = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
-    geometry.normals = o3d.utility.Vector3dVector(cloud.normals)
-    search = o3d.geometry.KDTreeSearchParamHybrid(
-        config.feature_radius * cloud.voxel_size, config.feature_neighbors
+    # The tensor API gives the legacy one's features in two thirds of its time. It works in single precision,
+    # hence centred and in voxels.
+    places = (cloud.points - cloud.points.mean(0)) / cloud.voxel_size
+    tensor = o3d.core.Tensor.from_numpy
+    geometry: Any = o3d.t.geometry.PointCloud(tensor(places.astype(np.float32)))
+    geometry.point.normals = tensor(cloud.normals.astype(np.float32))
+    raw = o3d.t.pipelines.registration.compute_fpfh_feature(
+        geometry, config.feature_neighbors, config.feature_radius
     )
-    raw = o3d.pipelines.registration.compute_fpfh_feature(geometry, search)  # type: ignore[call-arg]
-    features = np.asarray(raw.data).T.astype(np.float32)
+    features: Float32Array = raw.numpy()
     features = np.where(np.isfinite(features), features, np.float32(0))
     features /= np.linalg.norm(features, axis=1, keepdims=True) + np.float32(1e-6)
     return replace(cloud, features=np.ascontiguousarray(features))

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.estimators.base import check_correspondences
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, IntArray
 
 
@@ -53,6 +54,7 @@ class ConsensusEstimator:
     distinct_thresholds: float = 3.0
     max_dense: int = 5000
 
+    @single_blas_thread()
     def __call__(
         self,
         correspondences: ArrayLike,

@@ -1,0 +1,125 @@
+"""From hypotheses to findings about one pair of described clouds: verify, refine, judge.
+
+Hypotheses may come in several lots, from any estimator or grid; all are measured against the same clouds,
+so the choice among them does not depend on where they came from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from numpy.typing import ArrayLike
+
+from geomoe3d.answer import Findings
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.geometry.se3 import check_motion, shift_frames
+from geomoe3d.judge import judge, lead_over, measure_information
+from geomoe3d.refine import Refiner
+from geomoe3d.stages import StageClock
+from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.verification import Evidence, Verifier, best_first, clearly_different, distinct
+
+_CLOSE_LEAD = 2.0
+_KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
+_DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two motions are different
+
+
+class Refined(NamedTuple):
+    """A motion (4, 4) in local coordinates, what the clouds say of it, and what went wrong, if anything."""
+
+    T_target_source: FloatArray
+    evidence: Evidence
+    note: str | None
+
+
+class Chooser:
+    """Chooses among hypotheses by what the clouds say; build once per pair.
+
+    Args:
+        described: source and target on one grid, with features.
+        threshold: largest distance of points on the same surface, cloud units.
+        config: of the registration.
+        clock: told of the stages verify, refine and judge.
+    """
+
+    def __init__(
+        self,
+        described: tuple[PreparedCloud, PreparedCloud],
+        threshold: float,
+        config: RegistrationConfig,
+        clock: StageClock,
+    ) -> None:
+        self._described, self._threshold, self._config, self._clock = described, threshold, config, clock
+        clock("verify")
+        self._verifier = Verifier(*described, threshold, seed=config.seed)
+        self._refiner = Refiner(*described, config.refinement)
+        self._ranked: list[tuple[Hypothesis, Evidence]] = []
+        self._first: Hypothesis | None = None
+
+    def consider(self, hypotheses: list[Hypothesis]) -> None:
+        """Add a lot of hypotheses, the estimator's best one first."""
+        self._clock("verify")
+        if self._first is None and hypotheses:
+            self._first = hypotheses[0]
+        self._ranked = best_first(self._ranked + self._verifier.rank(hypotheses))
+
+    def consider_guess(self, initial: ArrayLike) -> None:
+        """Add a user's first guess (4, 4), file coordinates, and its refinement: verified, not trusted."""
+        source, target = self._described
+        T = shift_frames(check_motion(initial), -source.origin, -target.origin)
+        refined, _ = self._refiner(T)
+        self.consider([Hypothesis(motion, 0.0, 0) for motion in (T, refined)])
+
+    def conclude(self, num_refined: int = 1) -> Findings:
+        """The best of all hypotheses so far, and how sure.
+
+        Args:
+            num_refined: so many of the best distinct hypotheses are refined before the choice.
+        """
+        self._clock("refine")
+        answer = self._answer(num_refined)
+        self._clock("judge")
+        if answer is None:
+            return Findings.nothing("no motion brings three correspondences in general position together")
+        T, (source, target) = answer.T_target_source, self._described
+        other, lead = self._rival(answer)
+        information = measure_information(T, source, target, self._threshold)
+        judgement = judge(answer.evidence, lead, information, self._config.judgement)
+        findings = Findings(T, other, lead, answer.evidence, information, judgement)
+        return findings if answer.note is None else findings.with_note(answer.note)
+
+    def _answer(self, num_refined: int) -> Refined | None:
+        """The motion that the clouds, or without verification the correspondences, like best, refined."""
+        if self._first is None:
+            return None
+        if not self._config.verification.enabled:
+            return self._refine(self._first.T_target_source)
+        best = distinct(self._ranked, self._described[0], self._shift, num_refined)
+        return max((self._refine(h.T_target_source) for h in best), key=lambda found: found.evidence.score)
+
+    def _refine(self, T_target_source: FloatArray) -> Refined:
+        """The motion refined on the clouds, or as it was where that made them fit less well."""
+        T, note = self._refiner(T_target_source)
+        before, after = self._verifier.evidence(T_target_source), self._verifier.evidence(T)
+        if after.score < _KEPT_EVIDENCE * before.score:
+            note = "refinement made the clouds fit less well; the unrefined motion is given"
+            return Refined(T_target_source, before, note)
+        return Refined(T, after, note)
+
+    def _rival(self, answer: Refined) -> tuple[Hypothesis | None, float]:
+        """The best clearly different motion, and the answer's lead over it."""
+        T, source = answer.T_target_source, self._described[0]
+        other = clearly_different(self._ranked, T, source, self._shift)
+        lead = lead_over(answer.evidence, other[1] if other else None)
+        if other is not None and lead < _CLOSE_LEAD:  # a fair race: the rival is refined too
+            rival = self._refine(other[0].T_target_source)
+            if rival.evidence.score > other[1].score:
+                moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
+                other = clearly_different([moved], T, source, self._shift) or other
+                lead = lead_over(answer.evidence, other[1])
+        return (other[0] if other else None), lead
+
+    @property
+    def _shift(self) -> float:
+        return _DISTINCT_THRESHOLDS * self._threshold

@@ -1,0 +1,166 @@
+"""Second looks, the choice among lots of hypotheses, and the single thread they run on."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geomoe3d.choice import Chooser
+from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.prepare import prepare
+from geomoe3d.config import RegistrationConfig, load_config
+from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.errors import ConfigError, EmptyCloudError
+from geomoe3d.geometry.se3 import make_transform, rotation_error_deg
+from geomoe3d.registration import Registrar
+from geomoe3d.stages import StageClock
+from geomoe3d.threads import single_blas_thread
+from geomoe3d.types import Hypothesis
+from geomoe3d.verification import Evidence, distinct
+
+VOXEL = 0.05
+
+
+@pytest.fixture(scope="module")
+def pair():
+    config = RegistrationConfig().preparation
+    source, target, T = make_sample_pair(seed=0)
+    clouds = tuple(describe(prepare(c, VOXEL, config, viewpoint=-c.origin), config) for c in (source, target))
+    return clouds, T
+
+
+def chooser(pair, *assignments: str) -> Chooser:
+    config = load_config(None, list(assignments))
+    return Chooser(pair[0], 2 * VOXEL, config, StageClock())
+
+
+def off(T, degrees: float, shift: float) -> Hypothesis:
+    turn = make_transform(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.full(3, shift))
+    return Hypothesis(turn @ T, 1.0, 10)
+
+
+def test_the_clouds_choose_whatever_the_order_of_the_lots(pair):
+    right, wrong = off(pair[1], 0.5, 0.01), off(pair[1], 90, 1.0)
+    for lots in ([[wrong], [right]], [[right], [wrong]], [[wrong, right]]):
+        asked = chooser(pair)
+        for lot in lots:
+            asked.consider(lot)
+        findings = asked.conclude()
+        assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
+        assert findings.judgement.status == "ok"
+
+
+def test_refining_several_before_the_choice_saves_one_that_lay_off(pair):
+    """Three hypotheses, the right one too far off to look best; refined, it is."""
+    asked = chooser(pair)
+    asked.consider([off(pair[1], 90, 0.3), off(pair[1], 180, 0.2), off(pair[1], 4, 0.06)])
+    assert rotation_error_deg(asked.conclude(3).T_target_source, pair[1]) < 1
+
+
+def test_without_verification_the_first_of_the_first_lot_is_the_answer(pair):
+    asked = chooser(pair, "verification.enabled=false", "refinement.method=none")
+    asked.consider([off(pair[1], 90, 1.0), off(pair[1], 0, 0.0)])
+    asked.consider([off(pair[1], 0, 0.0)])
+    assert rotation_error_deg(asked.conclude().T_target_source, pair[1]) == pytest.approx(90)
+
+
+def test_nothing_considered_is_a_failure_and_not_identity(pair):
+    findings = chooser(pair).conclude(3)
+    assert findings.judgement.status == "failed"
+    assert np.isnan(findings.T_target_source).all()
+
+
+def test_distinct_motions_are_told_apart(pair):
+    evidence = Evidence(0.5, 0.5, 0.5, 0.0)
+    motions = [off(pair[1], 0, 0), off(pair[1], 5, 0.05), off(pair[1], 40, 0), off(pair[1], 42, 0)]
+    found = distinct([(h, evidence) for h in motions], pair[0][0], 6 * VOXEL, 3)
+    assert [id(h) for h in found] == [id(motions[0]), id(motions[2])]
+    assert len(distinct([(h, evidence) for h in motions], pair[0][0], 6 * VOXEL, 1)) == 1
+
+
+@pytest.fixture
+def grids_seen(monkeypatch):
+    """Edges of the grids on which hypotheses were sought."""
+    seen: list[float] = []
+    propose = Registrar.propose
+
+    def spy(self, described, clock):
+        seen.append(round(described[0].voxel_size / VOXEL, 6))
+        return propose(self, described, clock)
+
+    monkeypatch.setattr(Registrar, "propose", spy)
+    return seen
+
+
+def test_a_sure_answer_takes_no_second_look(grids_seen):
+    source, target, _ = make_sample_pair(seed=0)
+    assert Registrar(load_config(None, [f"voxel_size={VOXEL}"])).register(source, target).ok
+    assert grids_seen == [1]
+
+
+def test_an_unsure_answer_takes_one_on_every_coarser_grid(grids_seen):
+    source, target, T = make_sample_pair(seed=0)
+    settings = [f"voxel_size={VOXEL}", "judgement.min_confidence=1.0"]
+    result = Registrar(load_config(None, settings)).register(source, target)
+    assert grids_seen == [1, 1.5, 2]
+    assert rotation_error_deg(result.T_target_source, T) < 1
+    assert result.voxel_size == VOXEL
+    grids_seen.clear()
+    Registrar(load_config(None, [*settings, "second_look.grids=[]"])).register(source, target)
+    assert grids_seen == [1]
+
+
+def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatch):
+    describe_cloud = Registrar.describe_cloud
+
+    def small(self, cloud, voxel_size, viewpoint, clock):
+        if voxel_size > VOXEL:
+            raise EmptyCloudError("2 points remain")
+        return describe_cloud(self, cloud, voxel_size, viewpoint, clock)
+
+    monkeypatch.setattr(Registrar, "describe_cloud", small)
+    source, target, _ = make_sample_pair(seed=0)
+    settings = [f"voxel_size={VOXEL}", "judgement.min_confidence=1.0"]
+    assert Registrar(load_config(None, settings)).register(source, target).status != "failed"
+    assert grids_seen == [1]
+
+
+def test_a_second_look_on_a_finer_grid_is_refused():
+    with pytest.raises(ConfigError, match=r"second_look.grids.*above 1"):
+        load_config(None, ["second_look.grids=[0.5]"])
+
+
+def blas_threads() -> set[int]:
+    import scipy.linalg  # noqa: F401 - brings its own BLAS
+    from threadpoolctl import threadpool_info
+
+    return {entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"}
+
+
+def test_one_thread_inside_and_what_was_set_before_after_the_last_one_out():
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(2, user_api="blas"):
+        before = blas_threads()
+        entered, leave = threading.Event(), threading.Event()
+
+        def other() -> None:
+            with single_blas_thread():
+                entered.set()
+                leave.wait(10)
+
+        thread = threading.Thread(target=other)
+        with single_blas_thread():
+            thread.start()
+            assert entered.wait(10)
+            assert blas_threads() == {1}
+        assert blas_threads() == {1}  # the other is still inside
+        leave.set()
+        thread.join()
+        assert blas_threads() == before
+        with pytest.raises(KeyError), single_blas_thread():
+            raise KeyError
+        assert blas_threads() == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -21,15 +22,18 @@ from geomoe3d.data.threedmatch import (
     write_gt_log,
     write_gt_overlap,
 )
-from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
 from geomoe3d.evaluation import predict as module
 from geomoe3d.evaluation.benchmarks import load_pairs, thin_out
+from geomoe3d.evaluation.compare import compare
 from geomoe3d.evaluation.predict import MethodSpec, predict, predict_one
 from geomoe3d.evaluation.records import Answer, MethodInput, Prediction
 from geomoe3d.evaluation.store import decode, encode, find_runs, read_info, read_predictions
+from geomoe3d.evaluation.summary import summarise
 from geomoe3d.evaluation.task import Task, load_run_pairs
 from geomoe3d.evaluation.tracks import TRACKS, InputMaker
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
+from geomoe3d.journal import Journal
 
 COUNT = 4
 
@@ -240,7 +244,7 @@ def test_every_pair_once_and_then_never_again(folder: Path, tmp_path: Path, use)
     assert [p.pair for p in read_predictions(run)] == [p.id for p in load_pairs(str(folder))]
     report = run_one(folder, tmp_path)
     assert (report.made, report.kept) == (0, 6)
-    assert len(fake.seen) == 6
+    assert len(fake.seen) == 6 + 1  # once off the clock, to warm up
     assert [p.id for p in load_run_pairs(info)] == [p.id for p in load_pairs(str(folder))]
 
 
@@ -254,7 +258,7 @@ def test_only_what_is_missing_is_predicted(folder: Path, tmp_path: Path, use) ->
     use(fake=fake)
     report = run_one(folder, tmp_path)
     assert (report.made, report.kept) == (3, 3)
-    assert [given.pair for given in fake.seen] == [p.id for p in load_pairs(str(folder))][3:]
+    assert [given.pair for given in fake.seen[1:]] == [p.id for p in load_pairs(str(folder))][3:]
     assert len(read_predictions(file.parent)) == 6
 
 
@@ -293,6 +297,44 @@ def test_changed_truth_is_noticed(folder: Path, tmp_path: Path, use) -> None:
         load_run_pairs(read_info(tmp_path / "out" / "fake.clouds.posed"))
 
 
+def test_changed_input_is_noticed(folder: Path, tmp_path: Path, use) -> None:
+    import shutil
+
+    copy = tmp_path / "posed"
+    shutil.copytree(folder, copy)
+    use(fake=Fake())
+    run_one(copy, tmp_path / "out")
+    save_points(copy / "room" / "cloud_bin_2.ply", surface(np.random.default_rng(5)), force=True)
+    with pytest.raises(InputError, match=r"input\.files_sha256"):
+        run_one(copy, tmp_path / "out")
+
+
+def test_matched_input_depends_on_the_code_that_matches(folder: Path) -> None:
+    pairs = load_pairs(str(folder))
+    keys = {track: set(InputMaker(track, str(folder)).identity(pairs)) for track in TRACKS}
+    assert keys["clouds"] == {"from", "files_sha256"}
+    assert {"source_sha256", "preparation", "versions"} < keys["all"] == keys["1k"]
+
+
+def test_predictions_of_unknown_origin_never_mix(folder: Path, tmp_path: Path, use) -> None:
+    use(fake=Fake())
+    run_one(folder, tmp_path)
+    (tmp_path / "fake.clouds.posed" / "run.json").unlink()
+    with pytest.raises(InputError, match=r"'run\.json', which says what they come from, is gone"):
+        run_one(folder, tmp_path)
+    assert run_one(folder, tmp_path, fresh=True).made == 6
+
+
+def test_fresh_leaves_a_run_alone_that_another_process_writes(folder: Path, tmp_path: Path, use) -> None:
+    use(fake=Fake())
+    run_one(folder, tmp_path)
+    file = tmp_path / "fake.clouds.posed" / "predictions.jsonl"
+    before = file.read_bytes()
+    with Journal(file), pytest.raises(OutputError, match="another process"):
+        run_one(folder, tmp_path, fresh=True)
+    assert file.read_bytes() == before
+
+
 def test_two_methods_see_each_pair_in_turn(folder: Path, tmp_path: Path, use) -> None:
     order: list[str] = []
 
@@ -306,7 +348,7 @@ def test_two_methods_see_each_pair_in_turn(folder: Path, tmp_path: Path, use) ->
     use(a=Fake(noting("a")), b=Fake(noting("b")), gone=Fake(absent="pip install gone"))
     task = Task(str(folder), "clouds", every=2)
     report = predict(tmp_path, [MethodSpec("a"), MethodSpec("gone"), MethodSpec("b")], task)
-    assert order == ["a", "b"] * 3
+    assert order == ["a", "a", "b", "b", *["a", "b"] * 2]  # the first time once more, off the clock
     assert report.absent == {"gone": "pip install gone"}
     assert sorted(run.name for run in find_runs(tmp_path)) == [
         "a.clouds.posed.every2",
@@ -384,6 +426,63 @@ def test_two_workers_predict_the_same(folder: Path, tmp_path: Path) -> None:
         assert len(one) == 6
 
 
+DEADLY = """
+import os
+import numpy as np
+
+def harmless(source, target):
+    return np.eye(4)
+
+def deadly(source, target):
+    if source[0, 0] == LIMIT:
+        os._exit(9)
+    return np.eye(4)
+"""
+
+
+def test_a_method_that_takes_its_process_along_loses_that_pair_alone(folder: Path, tmp_path: Path) -> None:
+    pairs = load_pairs(str(folder))
+    victim = InputMaker("clouds", str(folder))(pairs[3]).source
+    assert victim is not None
+    own = tmp_path / "own.py"
+    own.write_text(DEADLY.replace("LIMIT", repr(float(victim[0, 0]))))
+    died = [pair.id for pair in pairs if pair.source == pairs[3].source]
+    specs = [MethodSpec(f"{own}:{name}", label=name) for name in ("harmless", "deadly")]
+    report = predict(tmp_path, specs, Task(str(folder), "clouds"), workers=2)
+    assert report.made == 12
+    harmless, deadly = (read_predictions(run) for run in report.folders)
+    assert [prediction.error for prediction in harmless] == [None] * 6
+    lost = {prediction.pair: prediction for prediction in deadly if prediction.error is not None}
+    assert sorted(lost) == sorted(died)
+    for prediction in lost.values():
+        assert "died" in (prediction.error or "")
+        assert prediction.T_target_source is None
+        assert math.isnan(prediction.seconds)
+    score = summarise(read_info(report.folders[1]), pairs, deadly, resamples=50)
+    assert score.measures["errors"].value == pytest.approx(100 * len(died) / 6)
+    assert score.measures["time_median"].count == 6 - len(died)
+    compare(score, summarise(read_info(report.folders[0]), pairs, harmless, resamples=50), resamples=50)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (Answer(np.eye(4), weights=np.ones(4)), r"weights of shape \(4,\) for 5 correspondences"),
+        (Answer(np.eye(4), inliers=np.ones(6, dtype=bool)), r"labels of shape \(6,\) for 5"),
+        (Answer(np.eye(4), weights=np.ones((5, 1))), r"weights of shape \(5, 1\) for 5"),
+        (Answer(np.eye(4), correspondences=np.ones((7, 6)), weights=np.ones(5)), r"for 7 correspondences"),
+    ],
+)
+def test_weights_and_labels_of_another_length_are_refused(answer: Answer, message: str) -> None:
+    given = MethodInput("a/0-1", correspondences=np.ones((5, 6)))
+    with pytest.raises(InputError, match=message):
+        predict_one(Fake(lambda _: answer), load_like(np.eye(4)), given)
+
+
+def test_unrelated_pairs_are_not_thinned() -> None:
+    assert Task("unrelated", "clouds", every=40) == Task("unrelated", "clouds")
+
+
 # ---- the published benchmark ------------------------------------------------------------------------
 
 
@@ -400,7 +499,7 @@ def test_published_pairs_and_their_fixed_correspondences() -> None:
         pairs = load_pairs(benchmark)
         assert len(pairs) == len({pair.id for pair in pairs}) == count
         maker = InputMaker("1k", benchmark)
-        assert maker.source == "published 1k correspondences"
+        assert maker.identity(pairs)["from"] == "published 1k correspondences"
         fixed = load_fixed_correspondences(None, benchmark)
         for pair, expected in list(zip(pairs, fixed, strict=True))[:: count // 20]:
             assert pair.id == f"{expected.scene}/{expected.source_index}-{expected.target_index}"

@@ -7,13 +7,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.journal import Journal, read_journal
-from geomoe3d.workers import run_parallel
 
 
 def test_records_come_back_in_order(tmp_path):
@@ -105,52 +103,3 @@ def test_what_was_appended_survives_sigkill(tmp_path):
     with Journal(path) as journal:
         journal.append({"k": "after"})
     assert [json.loads(line)["k"] for line in path.read_text().splitlines()] == [*kept, "after"]
-
-
-def _square(number):
-    if number == 13:
-        os.kill(os.getpid(), signal.SIGKILL)
-    if number < 0:
-        raise InputError(f"{number} is negative")
-    time.sleep(0.01)
-    return number, number * number, os.environ.get("OMP_NUM_THREADS")
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_every_item_is_done_once(workers):
-    items = [k for k in range(30) if k != 13]
-    results = list(run_parallel(_square, iter(items), workers=workers, threads=1))
-    assert sorted(r[0] for r in results) == items
-    assert all(square == number * number for number, square, _ in results)
-    if workers > 1:
-        assert {threads for *_, threads in results} == {"1"}
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_errors_of_an_item_pass_through(workers):
-    with pytest.raises(InputError, match="negative"):
-        list(run_parallel(_square, [1, -2, 3], workers=workers))
-
-
-def test_a_killed_worker_is_an_error_with_advice():
-    with pytest.raises(OutputError, match="fewer workers"):
-        list(run_parallel(_square, [1, 13, 2], workers=2))
-
-
-def test_items_are_read_only_as_far_as_needed():
-    taken = []
-
-    def items():
-        for k in range(100):
-            taken.append(k)
-            yield k if k != 13 else 14
-
-    results = run_parallel(_square, items(), workers=2)
-    next(results)
-    assert len(taken) <= 6
-    results.close()
-
-
-def test_no_workers_is_refused():
-    with pytest.raises(InputError, match="at least 1"):
-        list(run_parallel(_square, [1], workers=0))

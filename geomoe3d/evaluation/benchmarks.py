@@ -27,10 +27,10 @@ def load_pairs(
         benchmark: 3DMatch, 3DLoMatch; ``unrelated``: seeded pairs of fragments of different 3DMatch scenes;
             or a folder of posed fragments in any layout of `geomoe3d.data.collection` (a generated set, too).
         root: folder of the published benchmarks; None takes `geomoe3d.data.threedmatch.find_data_root`.
-        num_unrelated: pairs of ``unrelated``.
+        num_unrelated: pairs of ``unrelated``, at least 1.
 
     Raises:
-        InputError: no such benchmark or folder, or it lists no pairs.
+        InputError: no such benchmark or folder, it lists no pairs, or as many unrelated pairs cannot be.
         FormatError: a ground truth file is broken.
     """
     if benchmark in BENCHMARKS:
@@ -72,6 +72,8 @@ def _published(root: str | Path | None, benchmark: str) -> list[EvaluationPair]:
 
 def _unrelated(root: str | Path | None, count: int) -> list[EvaluationPair]:
     """A seeded choice; a longer list begins with the shorter one."""
+    if count < 1:
+        raise InputError(f"there must be at least 1 unrelated pair, found {count}")
     fragments: dict[str, list[Path]] = {}
     for pair in load_benchmark(root, "3DMatch"):
         known = fragments.setdefault(pair.scene, [])

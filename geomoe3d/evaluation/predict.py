@@ -1,17 +1,19 @@
 """Stage one: every method on every pair, each finished prediction kept at once.
 
 All methods see a pair one after the other, on the same input, so that the ratio of their times holds on a
-busy machine. Killed at any moment and started again, it goes on with what is missing. The truth is used for
-one thing only: to label the correspondences that a method weighed, after it has answered.
+busy machine. Killed at any moment and started again, it goes on with what is missing; with two workers or
+more, a method that takes its process with it loses that pair and nothing else. The truth is used for one
+thing only: to label the correspondences that a method weighed, after it has answered.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,7 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.journal import Journal
 from geomoe3d.provenance import hardware, source_commit, usable_cores
 from geomoe3d.types import BoolArray, FloatArray
-from geomoe3d.workers import run_parallel
+from geomoe3d.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def predict(
     Raises:
         InputError: no worker; an unknown method, benchmark or track; a method that cannot take the track's
             input; two runs of one name; a folder with predictions of another identity.
-        OutputError: the cache cannot be written, or a worker died.
+        OutputError: the cache cannot be written.
     """
     if workers < 1:
         raise InputError(f"there must be at least 1 worker, found {workers}")
@@ -128,19 +130,13 @@ def predict(
             for pair in pairs:
                 if pair.id not in done:
                     todo.setdefault(pair.id, []).append(number)
-        jobs = [(pair, tuple(todo[pair.id])) for pair in pairs if pair.id in todo]
+        jobs = [_Job(tuple(present), task, pair, tuple(todo[pair.id])) for pair in pairs if pair.id in todo]
         total, count = kept + sum(map(len, todo.values())), kept
         if progress is not None:
             progress(count, total)
-        results = run_parallel(
-            _predict_pair,
-            jobs,
-            workers=workers,
-            threads=_threads(workers),
-            setup=_set_up,
-            arguments=(tuple(present), task),
-        )
-        for answers in results:
+        _Bench.made_for = None  # files of the user's may have changed since the last call
+        pool = SerialPool() if workers == 1 else ProcessPool(workers, threads=_threads(workers))
+        for answers in _answers(pool, jobs):
             for number, record in answers:
                 journals[number].append(record)
                 count += 1
@@ -163,7 +159,7 @@ def _info(
     maker = InputMaker(task.track, task.benchmark, task.root)
     identity: dict[str, Any] = {
         "method": method.identity(),
-        "input": maker.source,
+        "input": maker.identity(pairs),
         "pairs": {
             "benchmark": task.benchmark,
             "root": task.root,
@@ -198,29 +194,84 @@ def _threads(workers: int) -> int:
     return max(1, usable_cores() // workers)
 
 
-class _Bench:
-    """What a worker keeps between pairs."""
+@dataclass(frozen=True)
+class _Job:
+    """One pair and the methods that have not answered it yet, by their place in ``specs``."""
 
+    specs: tuple[MethodSpec, ...]
+    task: Task
+    pair: EvaluationPair
+    numbers: tuple[int, ...]
+
+
+_Answers = list[tuple[int, dict[str, Any]]]
+
+
+def _answers(pool: Pool, jobs: Iterable[_Job]) -> Iterator[_Answers]:
+    """The records of every job. Where a process died over several methods, each is tried alone."""
+    apart: list[_Job] = []
+    for job, found in run_surviving(pool, _predict_pair, jobs):
+        if not isinstance(found, WorkerDied):
+            yield found
+        elif len(job.numbers) == 1:
+            yield [(job.numbers[0], encode(_no_answer(job.pair, found.reason)))]
+        else:
+            apart += [replace(job, numbers=(number,)) for number in job.numbers]
+    if apart:
+        yield from _answers(pool, apart)
+
+
+def _no_answer(pair: EvaluationPair, reason: str) -> Prediction:
+    """What is kept of a method that took its process with it; how long it took is not known."""
+    return Prediction(pair.id, None, None, None, (), None, None, math.nan, {}, None, reason)
+
+
+class _Bench:
+    """What a process keeps between pairs."""
+
+    made_for: tuple[tuple[MethodSpec, ...], Task] | None = None
     methods: Sequence[Method] = ()
     inputs: InputMaker
+    warm: set[int]
+
+    @classmethod
+    def set_up(cls, specs: tuple[MethodSpec, ...], task: Task) -> None:
+        """Make the methods and the maker of their input, unless they are there."""
+        if cls.made_for == (specs, task):
+            return
+        cls.made_for = None
+        cls.methods = [make_method(spec.spec, spec.assignments) for spec in specs]
+        cls.inputs = InputMaker(task.track, task.benchmark, task.root, seed=task.seed)
+        cls.warm = set()
+        cls.made_for = specs, task
+
+    @classmethod
+    def warm_up(cls, number: int, given: MethodInput) -> None:
+        """Let a method answer once in this process, off the clock: libraries load and threads start."""
+        if number not in cls.warm:
+            cls.warm.add(number)
+            with suppress(GeoMoE3DError):
+                cls.methods[number](given)
 
 
-def _set_up(specs: tuple[MethodSpec, ...], task: Task) -> None:
-    _Bench.methods = [make_method(spec.spec, spec.assignments) for spec in specs]
-    _Bench.inputs = InputMaker(task.track, task.benchmark, task.root, seed=task.seed)
-
-
-def _predict_pair(job: tuple[EvaluationPair, tuple[int, ...]]) -> list[tuple[int, dict[str, Any]]]:
+def _predict_pair(job: _Job) -> _Answers:
     """The named methods on one pair, as records."""
-    pair, numbers = job
-    given = _Bench.inputs(pair)
-    return [(number, encode(predict_one(_Bench.methods[number], pair, given))) for number in numbers]
+    _Bench.set_up(job.specs, job.task)
+    given = _Bench.inputs(job.pair)
+    found = []
+    for number in job.numbers:
+        _Bench.warm_up(number, given)
+        found.append((number, encode(predict_one(_Bench.methods[number], job.pair, given))))
+    return found
 
 
 def predict_one(method: Method, pair: EvaluationPair, given: MethodInput) -> Prediction:
     """One method on one pair, timed, its correspondences labelled.
 
     A `GeoMoE3DError` of the method makes a prediction without motion that holds its message.
+
+    Raises:
+        InputError: the method breaks its contract: weights or labels of another length than what it weighed.
     """
     error = None
     with PeakMemory() as memory:
@@ -230,6 +281,7 @@ def predict_one(method: Method, pair: EvaluationPair, given: MethodInput) -> Pre
         except GeoMoE3DError as caught:
             answer, error = Answer(None), str(caught)
         seconds = time.perf_counter() - begin
+    _check_lengths(method, answer, given)
     T = answer.T_target_source
     if T is not None and not np.isfinite(T).all():
         T = None
@@ -251,6 +303,20 @@ def predict_one(method: Method, pair: EvaluationPair, given: MethodInput) -> Pre
         peak_memory=memory.peak,
         error=error,
     )
+
+
+def _check_lengths(method: Method, answer: Answer, given: MethodInput) -> None:
+    """Labels of another length would be cut or filled up as they are stored, and scored all the same."""
+    rows = given.correspondences if answer.correspondences is None else answer.correspondences
+    for what, values in (("weights", answer.weights), ("labels", answer.inliers)):
+        if values is None:
+            continue
+        count = 0 if rows is None else len(rows)
+        if np.shape(values) != (count,):
+            raise InputError(
+                f"{given.pair}: '{method.name}' gives {what} of shape {np.shape(values)} for {count} "
+                f"correspondences, expected ({count},)"
+            )
 
 
 def _near(T: FloatArray | None, rows: FloatArray, limit: float) -> BoolArray:

@@ -149,7 +149,7 @@ class Prediction:
         hypotheses: as in `Answer`.
         labels: what became of the correspondences; None where the method shows none.
         weights: (N,) as in `Answer`, half precision, or None.
-        seconds: wall time of the call.
+        seconds: wall time of the call; NaN where its process died over it.
         stages: wall time per stage, may be empty.
         peak_memory: highest resident size of the process during the call, bytes, or None.
         error: what the method said instead of an answer, or None.
@@ -178,7 +178,7 @@ class RunInfo:
         track: 1k, all or clouds.
         benchmark: name of the benchmark.
         identity: everything that decides the predictions, `Method.identity` included.
-        commit: of the code, with ``+`` where it had local changes; None outside a checkout.
+        commit: of the code, ``-dirty`` where it had local changes; outside a checkout the installed version.
         hardware: processor, cores, memory.
         seed: of the method.
         command: the command line that made it.
@@ -221,7 +221,7 @@ class PairScore:
         verified_precision, verified_recall, verified_f1: of the labels that the motion gives.
         confidence: as predicted.
         status: as predicted.
-        seconds: wall time.
+        seconds: wall time; NaN where it is not known.
         stages: wall time per stage.
         peak_memory: bytes.
         error: as predicted.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
     """The journal of a run, and the pairs that it holds already; the folder is made if missing.
 
     Raises:
-        InputError: the folder holds predictions of another identity; names what differs.
+        InputError: the folder holds predictions of another identity (names what differs) or of none.
         OutputError: the folder or its files cannot be written, or another process writes them.
         FormatError: a file in it is damaged.
     """
@@ -45,6 +46,11 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
                 "Give another folder or label, or --fresh to predict again"
             )
     else:
+        if (folder / PREDICTIONS_FILE).is_file() and (folder / PREDICTIONS_FILE).stat().st_size:
+            raise InputError(
+                f"'{folder}' holds predictions, but '{RUN_FILE}', which says what they come from, is gone; "
+                "give another folder or label, or --fresh to predict again"
+            )
         text = json.dumps(asdict(info), indent=2)
         write_atomically(folder / RUN_FILE, lambda path: _put(path, text), force=False)
     journal = Journal(folder / PREDICTIONS_FILE)
@@ -60,8 +66,10 @@ def remove_run(folder: Path) -> None:
     """Delete the predictions of a run and what it says of itself; nothing else in the folder is touched.
 
     Raises:
-        OutputError: a file cannot be removed.
+        OutputError: a file cannot be removed, or another process is writing the predictions.
     """
+    if (folder / PREDICTIONS_FILE).is_file():
+        Journal(folder / PREDICTIONS_FILE).close()  # refused while another process holds it
     for name in (PREDICTIONS_FILE, RUN_FILE):
         try:
             (folder / name).unlink(missing_ok=True)
@@ -110,7 +118,10 @@ def read_predictions(folder: Path) -> list[Prediction]:
         try:
             prediction = decode(record)
         except (KeyError, TypeError, ValueError) as error:
-            raise FormatError(f"'{path}' line {number} is no prediction: {error!r}") from None
+            raise FormatError(
+                f"'{path}' line {number} is no prediction ({error!r}); the file was damaged: remove "
+                "that line and predict again, and what it stood for is done again"
+            ) from None
         predictions.setdefault(prediction.pair, prediction)
     return list(predictions.values())
 
@@ -133,7 +144,7 @@ def encode(prediction: Prediction) -> dict[str, Any]:
             "verified": _bits(labels.verified),
         },
         "weights": None if prediction.weights is None else _halves(prediction.weights),
-        "seconds": prediction.seconds,
+        "seconds": None if math.isnan(prediction.seconds) else prediction.seconds,
         "stages": prediction.stages,
         "peak_memory": prediction.peak_memory,
         "error": prediction.error,
@@ -163,7 +174,7 @@ def decode(record: dict[str, Any]) -> Prediction:
         weights=None
         if weights is None
         else np.frombuffer(base64.b64decode(weights), dtype="<f2").astype(np.float64),
-        seconds=float(record["seconds"]),
+        seconds=math.nan if record["seconds"] is None else float(record["seconds"]),
         stages=dict(record["stages"]),
         peak_memory=record["peak_memory"],
         error=record["error"],

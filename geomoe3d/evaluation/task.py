@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.data.threedmatch import BENCHMARKS
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, UNRELATED, load_pairs, thin_out
 from geomoe3d.evaluation.records import EvaluationPair, RunInfo
@@ -16,11 +18,13 @@ from geomoe3d.evaluation.records import EvaluationPair, RunInfo
 class Task:
     """What a set of predictions is made on.
 
+    Folders become absolute, so that a run is scored from any other folder, too.
+
     Attributes:
         benchmark: as in `load_pairs`.
         track: as in `geomoe3d.evaluation.tracks`.
         root: folder of the published benchmarks, or None.
-        every: every n-th pair.
+        every: every n-th pair; always 1 for ``unrelated``, whose number is given.
         num_unrelated: pairs of the benchmark ``unrelated``.
         seed: of the methods.
     """
@@ -32,10 +36,18 @@ class Task:
     num_unrelated: int = NUM_UNRELATED
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Bring the folders and the share of pairs into the one form that is stored and compared."""
+        if self.benchmark == UNRELATED:
+            object.__setattr__(self, "every", 1)
+        elif self.benchmark not in BENCHMARKS and Path(self.benchmark).is_dir():
+            object.__setattr__(self, "benchmark", str(Path(self.benchmark).resolve()))
+        if self.root is not None and Path(self.root).is_dir():
+            object.__setattr__(self, "root", str(Path(self.root).resolve()))
+
     def pairs(self) -> list[EvaluationPair]:
-        """The pairs, in the benchmark's order; the number of unrelated ones is not thinned."""
-        pairs = load_pairs(self.benchmark, self.root, num_unrelated=self.num_unrelated)
-        return pairs if self.benchmark == UNRELATED else thin_out(pairs, self.every)
+        """The pairs, in the benchmark's order."""
+        return thin_out(load_pairs(self.benchmark, self.root, num_unrelated=self.num_unrelated), self.every)
 
 
 def load_run_pairs(info: RunInfo) -> list[EvaluationPair]:

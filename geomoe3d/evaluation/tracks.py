@@ -12,22 +12,27 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+import geomoe3d
 from geomoe3d.clouds.matching import nearest_features
+from geomoe3d.config import PreparationConfig
 from geomoe3d.data.collection import load_fragment
 from geomoe3d.data.describe import describe_fragment
 from geomoe3d.data.threedmatch import BENCHMARKS, find_benchmark_root, load_fixed_scene
 from geomoe3d.errors import InputError
+from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.records import VOXEL_SIZE, EvaluationPair, MethodInput
 from geomoe3d.types import Float32Array, FloatArray
 
 TRACKS = ("1k", "all", "clouds")
 NUM_FIXED = 1000
+_HASHED_BYTES = 65536
 _KEPT_CLOUDS = 8
 _KEPT_FEATURES = 80  # a benchmark scene has at most 66 fragments, 0.7 MB each
 
@@ -62,12 +67,27 @@ class InputMaker:
         self._fixed_scene = ""
         self._published = _published_folder(track, benchmark, root)
 
-    @property
-    def source(self) -> str:
-        """Where the input comes from, for the identity of a run."""
+    def identity(self, pairs: Sequence[EvaluationPair]) -> dict[str, Any]:
+        """Where the input of these pairs comes from, for the identity of a run, as plain JSON.
+
+        Files enter with their size and their beginning, 64 KiB each: enough to notice other data under the
+        same names. Matched correspondences depend on the code that makes them, too.
+        """
+        files = {path for pair in pairs for path in (pair.source, pair.target)}
         if self.track == "clouds":
-            return "points of the files"
-        return "published 1k correspondences" if self._published else "matched on a 5 cm grid"
+            return {"from": "points of the files", "files_sha256": _hash_files(files)}
+        if self._published is not None:
+            files = {self._published / f"{pair.scene}.npz" for pair in pairs}
+            return {"from": "published 1k correspondences", "files_sha256": _hash_files(files)}
+        package = Path(geomoe3d.__file__).parent
+        code = {package / "data" / "describe.py", *(package / "clouds").glob("*.py")}
+        return {
+            "from": "matched on a 5 cm grid",
+            "files_sha256": _hash_files(files),
+            "source_sha256": _hash_files(code),
+            "preparation": PreparationConfig().model_dump(mode="json"),
+            "versions": versions("numpy", "scipy", "open3d-cpu", "open3d"),
+        }
 
     def __call__(self, pair: EvaluationPair) -> MethodInput:
         """The input of one pair.
@@ -109,6 +129,17 @@ class InputMaker:
         if pair.id not in self._fixed:
             raise InputError(f"'{self._published / pair.scene}.npz' lacks the pair {pair.id}")
         return self._fixed[pair.id]
+
+
+def _hash_files(files: Collection[Path]) -> str:
+    """Over names, sizes and beginnings; one that is missing counts as empty, reading it will say so."""
+    total = hashlib.sha256()
+    for path in sorted(files):
+        start, size = b"", 0
+        with suppress(OSError), path.open("rb") as stream:
+            start, size = stream.read(_HASHED_BYTES), path.stat().st_size
+        total.update(f"{path.parent.name}/{path.name} {size} ".encode() + hashlib.sha256(start).digest())
+    return total.hexdigest()
 
 
 Value = TypeVar("Value")

@@ -1,0 +1,97 @@
+"""Tasks in processes: each once, errors told, memory bounded, and nobody left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from geomoe3d.errors import InputError
+from geomoe3d.workers import Pool, ProcessPool, SerialPool, run_surviving
+
+
+def _square(number):
+    if number < 0:
+        raise InputError(f"{number} is negative")
+    time.sleep(0.01)
+    return number * number, os.environ.get("OMP_NUM_THREADS")
+
+
+def _pool(workers: int) -> Pool:
+    return SerialPool() if workers == 1 else ProcessPool(workers, threads=1)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_every_item_is_done_once(workers):
+    items = list(range(30))
+    results = list(run_surviving(_pool(workers), _square, iter(items)))
+    assert sorted(item for item, _ in results) == items
+    assert all(square == item * item for item, (square, _) in results)
+    if workers > 1:
+        assert {threads for _, (_, threads) in results} == {"1"}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_errors_of_an_item_pass_through(workers):
+    with pytest.raises(InputError, match="negative"):
+        list(run_surviving(_pool(workers), _square, [1, -2, 3]))
+
+
+def test_items_are_read_only_as_far_as_needed():
+    taken = []
+
+    def items():
+        for k in range(100):
+            taken.append(k)
+            yield k
+
+    results = run_surviving(_pool(2), _square, items())
+    next(results)
+    assert len(taken) <= 8
+    results.close()
+
+
+def test_no_workers_is_refused():
+    with pytest.raises(InputError, match="at least 1"):
+        ProcessPool(0)
+
+
+_PARENT = """
+import os, sys, time
+from geomoe3d.workers import ProcessPool, run_surviving
+sys.path.insert(0, sys.argv[1])
+from napping import nap
+if __name__ == "__main__":
+    for _ in run_surviving(ProcessPool(2), nap, [sys.argv[2]] * 100):
+        pass
+"""
+_NAP = """
+import os, time
+def nap(folder):
+    open(f"{folder}/{os.getpid()}", "w").close()
+    time.sleep(0.05)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path):
+    (tmp_path / "napping.py").write_text(_NAP)
+    (tmp_path / "parent.py").write_text(_PARENT)
+    seen = tmp_path / "seen"
+    seen.mkdir()
+    process = subprocess.Popen([sys.executable, tmp_path / "parent.py", tmp_path, seen])
+    deadline = time.monotonic() + 60
+    while len(list(seen.iterdir())) < 2:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    workers = [Path("/proc") / path.name for path in seen.iterdir()]
+    while any(worker.exists() for worker in workers):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.1)

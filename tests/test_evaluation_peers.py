@@ -184,6 +184,17 @@ def test_absent_library_is_reported_not_called(name, monkeypatch):
     assert peer.identity()["settings"] == PEERS[name]().identity()["settings"]
 
 
+def test_a_library_that_cannot_be_loaded_is_absent(tmp_path, monkeypatch):
+    (tmp_path / "kiss_matcher.py").write_text(
+        "raise ImportError('libGL.so.1: cannot open shared object file')"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "kiss_matcher", raising=False)
+    reason = PEERS["kiss-matcher"]().absent()
+    assert reason is not None
+    assert "installed but cannot be loaded (libGL.so.1" in reason
+
+
 @pytest.mark.parametrize("name", list(PEERS))
 def test_wrong_track_is_an_error(name):
     peer = PEERS[name]()
@@ -203,7 +214,7 @@ def test_a_librarys_complaint_is_an_error_of_the_pair(monkeypatch):
         raise RuntimeError("[Open3D Error] no")
 
     monkeypatch.setattr(Open3DRansac, "register", complain)
-    with pytest.raises(InputError, match=r"a/0-1: 'open3d-ransac-50k': \[Open3D Error\] no"):
+    with pytest.raises(InputError, match=r"a/0-1: 'open3d-ransac-50k': RuntimeError: \[Open3D Error\] no"):
         Open3DRansac()(MethodInput("a/0-1", correspondences=correspondences(1.0)))
 
 

@@ -1,13 +1,14 @@
 """What all of other people's methods share: recentring, settings, versions, and being absent.
 
-A peer imports its library when it is first called; one that is not installed makes the peer absent, never a
-failure. Clouds and correspondences are recentred first, because some of these libraries compute in single
-precision. Place: below `peers` and `open3d_peers`.
+A library is imported when its peer is asked for; one that is not installed, or cannot be loaded, makes the
+peer absent, never a failure. Clouds and correspondences are recentred first, because some of these libraries
+compute in single precision. Place: below `peers` and `open3d_peers`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import importlib.util
 import inspect
 from dataclasses import asdict, dataclass
@@ -18,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.errors import InputError
+from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import make_transform, project_to_so3, shift_frames
 from geomoe3d.types import FloatArray
@@ -62,11 +63,20 @@ class Peer:
         }
 
     def absent(self) -> str | None:
-        """Which library is missing, and how to install it; None where the peer can run."""
-        if importlib.util.find_spec(self.module) is not None:
-            return None
+        """Which library is missing or cannot be loaded, how to install it; None where the peer can run."""
         limits = f" ({self.limits})" if self.limits else ""
-        return f"'{self.name}' needs {self.distributions[0]}, which is not installed: {INSTALL}{limits}"
+        if importlib.util.find_spec(self.module) is None:
+            return f"'{self.name}' needs {self.distributions[0]}, which is not installed: {INSTALL}{limits}"
+        try:
+            importlib.import_module(self.module)
+        except (ImportError, OSError, AttributeError, RuntimeError) as error:
+            # Say, a shared library of the system is missing, or it was built for another numpy.
+            reason = " ".join(str(error).split())
+            return (
+                f"'{self.name}' needs {self.distributions[0]}, which is installed but cannot be loaded "
+                f"({reason}): {INSTALL}{limits}"
+            )
+        return None
 
     def __call__(self, given: MethodInput) -> Answer:
         """Register one pair; see `Method`.
@@ -86,8 +96,10 @@ class Peer:
         origins = (far if self.common_origin else choose_origin(source)), far
         try:
             answer = self.register(source - origins[0], target - origins[1], given)
-        except RuntimeError as error:  # how the libraries' own C++ complains of one pair
-            raise InputError(f"{given.pair}: '{self.name}': {error}") from error
+        except GeoMoE3DError:
+            raise
+        except Exception as error:  # a library's complaint of one pair must not end all the others
+            raise InputError(f"{given.pair}: '{self.name}': {type(error).__name__}: {error}") from error
         T = answer.T_target_source
         if T is None or not np.isfinite(T).all():
             return Answer(None, inliers=answer.inliers, seconds=answer.seconds)

@@ -93,8 +93,11 @@ def test_reports_are_not_overwritten(study: Path, tmp_path: Path, capsys: pytest
 def test_compare(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate("compare", study / "right.clouds.posed", study / "silent.clouds.posed") == 0
     out = capsys.readouterr().out
-    assert "only right right | 3 |" in out
+    assert " ".join(out.split()).count("only right right 3 ") == 1
     assert "McNemar" in out
+    assert "\nonly right right:\n  room/cloud_bin_0--cloud_bin_1\n" in out
+    for name in ("commit", "hardware", "seed", "command"):
+        assert f"\n{name}: " in out
     assert evaluate("compare", study, study / "silent.clouds.posed") == 2
     assert "holds 2 runs" in capsys.readouterr().err
 
@@ -111,7 +114,27 @@ def test_an_error_of_a_method_fails_its_pairs_alone(
     folder: Path, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluate("run", tmp_path, "--method", f"{own}:broken", "--benchmark", folder) == 0
-    assert "ended with an error on 3 of 3 pairs" in " ".join(capsys.readouterr().out.split())
+    out = " ".join(capsys.readouterr().out.split())
+    assert "ended with an error on 3 of 3 pairs" in out
+    assert "raised ValueError: no idea (mine.py, line 16)" in out
+
+
+def test_a_wrong_second_benchmark_is_told_before_the_first_is_done(
+    folder: Path, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--method", f"{own}:right", "--benchmark", folder, "--benchmark", "4DMatch"]
+    assert evaluate("predict", tmp_path / "out", *words) == 2
+    assert "no benchmark '4DMatch'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_relative_folder_gave_is_scored_from_elsewhere(
+    folder: Path, own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    assert evaluate("predict", tmp_path, "--method", f"{own}:right", "--benchmark", folder.name) == 0
+    monkeypatch.chdir(tmp_path)
+    assert evaluate("score", tmp_path, "--quiet") == 0
 
 
 def test_methods_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,6 +152,7 @@ def test_methods_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         (["--method", "geomoe3d", "--track", "2k"], "no track '2k'"),
         (["--method", "geomoe3d", "--every", "0"], "at least 1"),
         (["--method", "geomoe3d", "--workers", "0"], "at least 1 worker"),
+        (["--method", "geomoe3d", "--benchmark", "unrelated", "--unrelated", "0"], "at least 1 unrelated"),
         (["--method", "geomoe3d", "--set", "voxel=1"], "voxel_size"),
         (["--method", "kiss-matcher", "--set", "voxel_size=1"], "not among those given"),
         (["--method", "geomoe3d", "--method", "kiss-matcher", "--label", "x"], "names one run"),

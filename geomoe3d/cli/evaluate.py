@@ -66,7 +66,12 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
             ),
             click.option("--label", help="What to call the run, where there is one method. [its name]"),
             click.option("--data", "root", metavar="FOLDER", help="Of the benchmarks. [GEOMOE3D_DATA]"),
-            click.option("--workers", default=1, show_default=True, help="Processes over pairs."),
+            click.option(
+                "--workers",
+                default=1,
+                show_default=True,
+                help="Processes over pairs; two or more outlive a method that crashes.",
+            ),
             click.option("--seed", default=0, show_default=True, help="Same seed, same predictions."),
             click.option("--fresh", is_flag=True, help="Remove what these runs hold and predict again."),
         )
@@ -141,13 +146,14 @@ def compare(first: str, second: str) -> None:
     """Compare two runs pair by pair: who is right where, McNemar's test, ratio of the times."""
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.compare import compare as compare_scores
-    from geomoe3d.evaluation.report_markdown import comparison_text
+    from geomoe3d.evaluation.report_terminal import terminal_comparison
 
     runs = [_score(Path(folder), raw=False) for folder in (first, second)]
     for folder, found in zip((first, second), runs, strict=True):
         if len(found) != 1:
             raise InputError(f"'{folder}' holds {len(found)} runs; give the folder of one of them")
-    click.echo(comparison_text(compare_scores(runs[0][0].score, runs[1][0].score)))
+    a, b = (found[0].score for found in runs)
+    click.echo(terminal_comparison(a, b, compare_scores(a, b)))
 
 
 @command.command(context_settings=HELP)
@@ -188,9 +194,11 @@ def _predict(
     if assignments and "geomoe3d" not in methods:
         raise InputError("--set is for the method geomoe3d, which is not among those given")
     specs = [MethodSpec(name, assignments if name == "geomoe3d" else (), label) for name in methods]
+    tasks = [Task(benchmark, track, root, every, num_unrelated, seed) for benchmark in benchmarks]
+    for task in tasks[1:]:
+        task.pairs()  # a wrong name is told at once, not when the first benchmark is done
     made = absent = 0
-    for benchmark in benchmarks:
-        task = Task(benchmark, track, root, every, num_unrelated, seed)
+    for task in tasks:
         with stdout_to_stderr(), progress_bar("predictions", quiet=False) as advance:
             report = predict(
                 study, specs, task, workers=workers, fresh=fresh, command=command_line(), progress=advance

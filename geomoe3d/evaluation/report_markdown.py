@@ -10,6 +10,7 @@ from geomoe3d.evaluation.records import Calibration, Curve, Measure, RunScore
 from geomoe3d.evaluation.report_words import (
     HEADINGS,
     LEGEND,
+    comparison_rows,
     finite,
     groups_of,
     interval_text,
@@ -43,11 +44,6 @@ def to_markdown(scores: Sequence[RunScore], comparisons: Sequence[Comparison] = 
     for run in scores:
         lines += _run(run)
     return "\n".join(lines).rstrip() + "\n"
-
-
-def comparison_text(found: Comparison) -> str:
-    """One comparison of two runs."""
-    return "\n".join(_comparison(found)).rstrip()
 
 
 def benchmark_tables(scores: Sequence[RunScore]) -> str:
@@ -123,20 +119,7 @@ def _comparison(found: Comparison) -> list[str]:
         "",
     ]
     lines += [f"- {_escaped(note)}" for note in found.notes] + ([""] if found.notes else [])
-    rows = []
-    if found.recall_difference is not None and found.mcnemar_p is not None:
-        rows = [
-            ["both right", f"{found.num_both_right:,}"],
-            [f"only {a} right", f"{len(found.a_only_right):,}"],
-            [f"only {b} right", f"{len(found.b_only_right):,}"],
-            ["neither right", f"{found.num_neither_right:,}"],
-            ["exact McNemar p", f"{found.mcnemar_p:.3g}"],
-            [f"recall of {a} minus {b}, points", with_intervals(found.recall_difference, signed=True)],
-        ]
-    rows += [
-        [f"median time of {a} over that of {b}", with_intervals(found.time_ratio)],
-        [f"median of time of {a} over time of {b}", with_intervals(found.pair_time_ratio)],
-    ]
+    rows = [list(row) for row in comparison_rows(found, (a, b))]
     lines += _table(["", "value [95 % over pairs] [over scenes]"], rows)
     for who, ids in ((a, found.a_only_right), (b, found.b_only_right)):
         if ids:

@@ -16,11 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from geomoe3d import __version__
-from geomoe3d.data.threedmatch import BENCHMARKS
 from geomoe3d.errors import InputError
-from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison
-from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunInfo, RunScore
+from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 from geomoe3d.evaluation.report_chart import escape
 from geomoe3d.evaluation.report_gallery import (
     MAX_POINTS,
@@ -41,7 +39,7 @@ from geomoe3d.evaluation.report_tables import (
     scene_tables,
     swatch,
 )
-from geomoe3d.evaluation.report_words import LEGEND, thinning, warnings
+from geomoe3d.evaluation.report_words import LEGEND, benchmark_rank, run_key, warnings
 from geomoe3d.files import write_atomically
 from geomoe3d.visual.page import embed_json
 
@@ -79,12 +77,6 @@ def save_report(
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
     write_atomically(path, write, force=force)
-
-
-def run_key(info: RunInfo) -> str:
-    """What tells a run from every other of a report: label, track, benchmark, and the share of its pairs."""
-    every = thinning(info)
-    return f"{info.label}.{info.track}.{info.benchmark}" + (f".every{every}" if every > 1 else "")
 
 
 def render_report(
@@ -159,9 +151,8 @@ def _group(scores: Sequence[RunScore]) -> dict[Group, list[RunScore]]:
 
     def rank(score: RunScore) -> tuple[Any, ...]:
         name = score.info.benchmark
-        order = BENCHMARKS.index(name) if name in BENCHMARKS else len(BENCHMARKS) + (name == UNRELATED)
         best = -_value(score, "recall_15", -1.0), _value(score, "accepted", 101.0)
-        return order, name, score.info.track, *best, score.info.label
+        return benchmark_rank(name), name, score.info.track, *best, score.info.label
 
     groups: dict[Group, list[RunScore]] = {}
     for score in sorted(scores, key=rank):

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.records import RunScore
 from geomoe3d.evaluation.report_words import (
     HEADINGS,
     LEGEND,
+    comparison_rows,
     groups_of,
     interval_text,
     main_row,
     pairs_text,
-    provenance,
+    shared_provenance,
     warnings,
 )
 
@@ -35,7 +37,9 @@ def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, colo
     console = Console(width=width or NATURAL_WIDTH, color_system="standard" if color else None)
     with console.capture() as captured:
         for (benchmark, track), runs in groups_of(scores).items():
-            console.print(Text(f"{benchmark}, track {track}", style="bold"))
+            sizes = {pairs_text(run) for run in runs}
+            size = f", {sizes.pop()}" if len(sizes) == 1 else ""
+            console.print(Text(f"{benchmark}, track {track}{size}", style="bold"))
             for columns in _columns(console.width):
                 table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
                 table.add_column("run", overflow="fold")
@@ -44,7 +48,7 @@ def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, colo
                 for run in runs:
                     cells = main_row(run)
                     cells[0] = f"{cells[0]}\n{interval_text(run.measures.get('recall_15'), gap=' ')}".rstrip()
-                    first = Text(f"{run.info.label}\n{pairs_text(run)}")
+                    first = Text(run.info.label if size else f"{run.info.label}\n{pairs_text(run)}")
                     table.add_row(first, *(Text(cell) for cell in cells[columns]))
                 console.print(table)
             for run in runs:
@@ -52,12 +56,34 @@ def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, colo
                     console.print(Text(f"WARNING: {warning}", style="bold red"))
             console.print()
         console.print(Text(LEGEND))
-        for run in scores:
-            console.print()
-            console.print(Text(run.info.label, style="bold"), Text(f"({run.info.method})"))
-            for name, value in provenance(run):
-                console.print(Text(f"  {name}: {value}"), soft_wrap=True)
+        console.print()
+        for name, value in shared_provenance(scores):
+            console.print(Text(f"{name}: {value}"), soft_wrap=True)
     return captured.get().rstrip("\n")
+
+
+def terminal_comparison(a: RunScore, b: RunScore, found: Comparison) -> str:
+    """Two runs against each other, and below what they came from.
+
+    Args:
+        a: the first run.
+        b: the second run.
+        found: what `compare` says of them.
+    """
+    names = found.a.label, found.b.label
+    if names[0] == names[1]:  # one method at two commits, say
+        names = f"first {names[0]}", f"second {names[1]}"
+    rows = comparison_rows(found, names)
+    width = max(len(name) for name, _ in rows)
+    lines = [
+        f"{names[0]} against {names[1]} on {found.a.benchmark}, track {found.a.track}",
+        "(values with their 95 % intervals over pairs and over scenes)",
+        *(f"  {name:{width}}  {value}" for name, value in rows),
+        *(f"NOTE: {note}" for note in found.notes),
+    ]
+    for who, ids in zip(names, (found.a_only_right, found.b_only_right), strict=True):
+        lines += ["", f"only {who} right:", *(f"  {name}" for name in ids)] if ids else []
+    return "\n".join([*lines, "", *(f"{name}: {value}" for name, value in shared_provenance([a, b]))])
 
 
 def _columns(width: int) -> list[slice]:

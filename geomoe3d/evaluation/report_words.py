@@ -6,6 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from geomoe3d.data.threedmatch import BENCHMARKS
+from geomoe3d.evaluation.benchmarks import UNRELATED
+from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
 
 HEADINGS = (
@@ -41,6 +44,9 @@ MAIN_MEASURES = (
 """Columns of the main table, one for each of the headings."""
 
 
+_LONGEST_ERROR = 300
+
+
 def main_row(run: RunScore) -> list[str]:
     """The cells of the main table without the name of the run; ``-`` where a measure is not defined."""
     return [value_text(run.measures.get(name)) for name in MAIN_MEASURES]
@@ -54,11 +60,12 @@ def warnings(run: RunScore) -> list[str]:
             f"'{run.info.label}' has not answered {run.num_missing:,} of {run.num_pairs:,} pairs; its "
             f"numbers are over the other {run.num_pairs - run.num_missing:,} and not those of the benchmark"
         )
-    errors = sum(score.error is not None for score in run.pairs)
+    errors = [score.error for score in run.pairs if score.error is not None]
     if errors:
+        first = " ".join(errors[0].split())
         found.append(
-            f"'{run.info.label}' ended with an error on {errors:,} of {len(run.pairs):,} pairs; they count "
-            "as not right"
+            f"'{run.info.label}' ended with an error on {len(errors):,} of {len(run.pairs):,} pairs; they "
+            f"count as not right; the first: {first[:_LONGEST_ERROR]}{'...' * (len(first) > _LONGEST_ERROR)}"
         )
     if run.raw_truth:
         found.append(
@@ -69,11 +76,16 @@ def warnings(run: RunScore) -> list[str]:
 
 
 def groups_of(scores: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]:
-    """Runs by benchmark and track, in order of first appearance."""
+    """Runs by benchmark and track: published benchmarks first, unrelated scans last, tracks as they come."""
     groups: dict[tuple[str, str], list[RunScore]] = {}
-    for run in scores:
+    for run in sorted(scores, key=lambda run: benchmark_rank(run.info.benchmark)):
         groups.setdefault((run.info.benchmark, run.info.track), []).append(run)
     return groups
+
+
+def benchmark_rank(name: str) -> int:
+    """Place of a benchmark in a report: 3DMatch, 3DLoMatch, folders, unrelated scans."""
+    return BENCHMARKS.index(name) if name in BENCHMARKS else len(BENCHMARKS) + (name == UNRELATED)
 
 
 def thinning(info: RunInfo) -> int:
@@ -101,6 +113,28 @@ def provenance(run: RunScore) -> list[tuple[str, str]]:
         ("created", info.created),
         ("command", info.command),
     ]
+
+
+def shared_provenance(runs: Sequence[RunScore]) -> list[tuple[str, str]]:
+    """What several runs came from; what they have in common once, else with the names of the runs."""
+    rows = {run_key(run.info): dict(provenance(run)) for run in runs}
+    found: list[tuple[str, str]] = []
+    for name in ("commit", "hardware", "seed", "created", "command"):
+        values: dict[str, list[str]] = {}
+        for run, row in rows.items():
+            values.setdefault(row[name], []).append(run)
+        if name == "created" and len(values) > 1:
+            found.append((name, f"{min(values)} to {max(values)}"))
+            continue
+        for value, named in values.items():
+            found.append((name, value if len(values) == 1 else f"{value} ({', '.join(named)})"))
+    return found
+
+
+def run_key(info: RunInfo) -> str:
+    """What tells a run from every other of a report: label, track, benchmark, and the share of its pairs."""
+    every = thinning(info)
+    return f"{info.label}.{info.track}.{info.benchmark}" + (f".every{every}" if every > 1 else "")
 
 
 def number_text(value: float, digits: int) -> str:
@@ -131,6 +165,26 @@ def with_intervals(measure: Measure, *, signed: bool = False) -> str:
     return " ".join(
         part for part in (value, interval_text(measure), interval_text(measure, over_scenes=True)) if part
     )
+
+
+def comparison_rows(found: Comparison, names: tuple[str, str]) -> list[tuple[str, str]]:
+    """What two runs come to against each other, as names and values; unrelated scans have times alone."""
+    a, b = names
+    rows = [("pairs answered by both", f"{found.num_pairs:,}")]
+    if found.recall_difference is not None and found.mcnemar_p is not None:
+        rows += [
+            ("both right", f"{found.num_both_right:,}"),
+            (f"only {a} right", f"{len(found.a_only_right):,}"),
+            (f"only {b} right", f"{len(found.b_only_right):,}"),
+            ("neither right", f"{found.num_neither_right:,}"),
+            ("exact McNemar p", f"{found.mcnemar_p:.3g}"),
+            (f"recall of {a} minus {b}, points", with_intervals(found.recall_difference, signed=True)),
+        ]
+    return [
+        *rows,
+        (f"median time of {a} over that of {b}", with_intervals(found.time_ratio)),
+        (f"median of time of {a} over time of {b}", with_intervals(found.pair_time_ratio)),
+    ]
 
 
 def finite(value: Any) -> Any:

@@ -15,6 +15,7 @@ from geomoe3d.evaluation.compare import Comparison, compare
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 from geomoe3d.evaluation.report_json import to_json
 from geomoe3d.evaluation.report_markdown import to_markdown
+from geomoe3d.evaluation.report_words import run_key
 from geomoe3d.evaluation.store import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.evaluation.task import load_run_pairs
@@ -87,7 +88,7 @@ def write_report(path: str | Path, runs: list[StudiedRun], *, force: bool = Fals
     path = Path(path)
     scores, comparisons = [run.score for run in runs], compare_all(runs)
     if path.suffix == ".html":
-        from geomoe3d.evaluation.report_page import run_key, save_report
+        from geomoe3d.evaluation.report_page import save_report
 
         save_report(
             path,

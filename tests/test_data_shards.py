@@ -64,6 +64,17 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return base / "described"
 
 
+def test_two_workers_make_the_same_bytes_as_one(shards: Path, tmp_path: Path) -> None:
+    report = describe_collection(shards.parent / "posed", tmp_path, workers=2)
+    assert (report.made, report.num_fragments, report.num_pairs) == (2, 6, 6)
+    files = sorted(path.relative_to(shards) for path in shards.rglob("*") if path.is_file())
+    assert len(files) > 6
+    for name in files:
+        assert (tmp_path / name).read_bytes() == (shards / name).read_bytes(), name
+    with pytest.raises(InputError, match="at least one worker"):
+        describe_collection(shards.parent / "posed", tmp_path, workers=0)
+
+
 def test_shard_round_trip(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     scene = DescribedScene(

@@ -218,9 +218,10 @@ def synthesize(
 @click.option("--group", "groups", multiple=True, help="List of pairs to take, e.g. train_info; repeatable.")
 @click.option("--scene", "scenes", multiple=True, help="Scene to take (default: all); repeatable.")
 @click.option("--min-overlap", default=0.1, show_default=True, help="Least overlap of a pair.")
+@click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
 @traceback_option
 def features(
-    root: str, out: str, groups: tuple[str, ...], scenes: tuple[str, ...], min_overlap: float
+    root: str, out: str, groups: tuple[str, ...], scenes: tuple[str, ...], min_overlap: float, workers: int
 ) -> None:
     """Describe the fragments of ROOT once, into the shards OUT that training reads.
 
@@ -237,6 +238,7 @@ def features(
             groups=groups or None,
             scenes=scenes or None,
             min_overlap=min_overlap,
+            workers=workers,
             progress=advance,
         )
     for line in report.skipped:

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +71,7 @@ def describe_collection(
     scenes: tuple[str, ...] | None = None,
     min_overlap: float = 0.1,
     voxel_size: float = VOXEL_SIZE,
+    workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> DescribeReport:
     """Make one shard per scene of a folder of posed fragments; those that are there and fit stay.
@@ -79,10 +83,11 @@ def describe_collection(
         scenes: scenes to take; None takes all.
         min_overlap: pairs below it are left out; where no overlap is listed it is measured.
         voxel_size: metres.
+        workers: processes over scenes; the shards are the same for any number.
         progress: called with (scenes done, scenes in all).
 
     Raises:
-        InputError: the layout is unknown, or no pair is left.
+        InputError: the layout is unknown, or no pair is left, or there is no worker.
         FormatError: a shard in the folder is damaged or stale; the message says why.
         OutputError: the disk refuses.
     """
@@ -105,24 +110,73 @@ def describe_collection(
         "preparation": PreparationConfig().model_dump(mode="json"),
         "groups": list(groups) if groups is not None else None,
     }
-    for number, (scene, pairs) in enumerate(by_scene.items()):
+    jobs = []
+    for scene, pairs in by_scene.items():
         target = folder / scene.replace("/", "_")
         source = _fingerprint(pairs)
-        if is_shard(target):
-            reason = why_stale(target, settings, source)
-            if reason is not None:
-                raise FormatError(f"shard '{target}' is stale: {reason}; remove it, or give another folder")
-            report.kept += 1
-        else:
-            described = _describe_scene(scene, pairs, min_overlap, voxel_size, report.skipped)
-            if described is not None:
-                write_shard(target, described, settings, source)
-                report.made += 1
-                report.num_fragments += len(described.start) - 1
-                report.num_pairs += len(described.pair)
+        if not is_shard(target):
+            jobs.append(_Job(scene, pairs, target, min_overlap, voxel_size, settings, source))
+            continue
+        reason = why_stale(target, settings, source)
+        if reason is not None:
+            raise FormatError(f"shard '{target}' is stale: {reason}; remove it, or give another folder")
+        report.kept += 1
+    done = report.kept
+    for made in _run(jobs, workers):
+        report.skipped += made.skipped
+        report.made += made.made
+        report.num_fragments += made.num_fragments
+        report.num_pairs += made.num_pairs
+        done += 1
         if progress is not None:
-            progress(number + 1, len(by_scene))
+            progress(done, len(by_scene))
     return report
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One shard to be made; travels to another process."""
+
+    scene: str
+    pairs: list[PosedPair]
+    target: Path
+    min_overlap: float
+    voxel_size: float
+    settings: dict[str, Any]
+    source: str
+
+
+@dataclass(frozen=True)
+class _Made:
+    made: int
+    num_fragments: int
+    num_pairs: int
+    skipped: list[str]
+
+
+def _run(jobs: list[_Job], workers: int) -> Iterator[_Made]:
+    """Results in the order of the jobs."""
+    if workers < 1:
+        raise InputError(f"at least one worker is needed, found {workers}")
+    if workers == 1 or len(jobs) < 2:
+        yield from map(_make_shard, jobs)
+        return
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
+        try:
+            yield from pool.map(_make_shard, jobs)
+        except BrokenProcessPool:
+            raise InputError(
+                "a worker died, perhaps for lack of memory; the same command goes on, with fewer --workers"
+            ) from None
+
+
+def _make_shard(job: _Job) -> _Made:
+    skipped: list[str] = []
+    described = _describe_scene(job.scene, job.pairs, job.min_overlap, job.voxel_size, skipped)
+    if described is None:
+        return _Made(0, 0, 0, skipped)
+    write_shard(job.target, described, job.settings, job.source)
+    return _Made(1, len(described.start) - 1, len(described.pair), skipped)
 
 
 def _describe_scene(

@@ -30,7 +30,7 @@ from geomoe3d.geometry.se3 import (
 )
 from geomoe3d.journal import read_journal
 from geomoe3d.multiway.alignment import Surface, align_scans
-from geomoe3d.multiway.edges import Edge, Shape, agrees, displacement
+from geomoe3d.multiway.edges import Edge, Shape, agrees, deviation_at, displacement, expected_error
 from geomoe3d.multiway.formats import quaternion, right_information
 from geomoe3d.multiway.grouping import Group, GroupingRules, connected_parts, group_scans, settle
 from geomoe3d.multiway.overlaps import Overlaps
@@ -42,7 +42,7 @@ from geomoe3d.types import PointCloud
 
 CONFIG = load_config(None, SETTINGS)
 UTM = np.array([583394.0, 5283100.0, 498.0])
-RULES = GroupingRules(tolerance=0.2, near_tolerance=0.125, kept_tolerance=0.125)
+RULES = GroupingRules(tolerance=0.2, near_tolerance=0.125, kept_tolerance=0.125, kept_error=0.4)
 CUTS = ((0.0, 2.6), (0.5, 3.1), (1.0, 3.6), (1.4, 4.0), (1.8, 4.6))
 
 
@@ -370,6 +370,33 @@ def test_an_edge_that_the_aligned_surfaces_contradict_is_not_kept():
     assert [sorted(group.poses) for group in groups] == [[0, 1, 2, 3, 5, 6, 7], [4]]
 
 
+def test_an_edge_whose_surfaces_hold_the_sensor_loosely_is_not_kept():
+    shapes, truth, edges, _ = graph(noise=0.002)
+    edges[3] = replace(edges[3], looseness=0.03)  # times the correlation, 20: more than 0.4
+    (group,) = settle(Group(dict(truth), list(edges)), edges, shapes, RULES)
+    assert {id(e) for e in group.edges} == {id(e) for k, e in enumerate(edges) if k != 3}
+
+
+def test_looseness_is_the_deviation_of_the_sensor():
+    rng = np.random.default_rng(4)
+    points, normals = rng.normal((0, 0, 2), 1, (300, 3)), rng.normal(size=(300, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    J = np.hstack([np.cross(points, normals), normals])
+    sensor = np.array([0.3, -0.2, 0.1])
+    moved = []
+    for _ in range(4000):  # noise of every gap, the motion that fits it best, and where that puts the sensor
+        w, v = np.split(np.linalg.lstsq(J, 0.01 * rng.normal(size=300), rcond=None)[0], 2)
+        moved.append(np.cross(w, sensor) + v)
+    expected = np.sqrt((np.array(moved) ** 2).sum(1).mean())
+    assert deviation_at(J.T @ J / 0.01**2, sensor) == pytest.approx(expected, rel=0.03)
+    shape = Shape.of(points, np.zeros(3), sensor)
+    T = make_transform(Rotation.from_rotvec([0.1, 0, 0]).as_matrix(), np.array([0.2, 0, 0]))
+    one = Edge(1, 0, T, 0.9, np.eye(6), looseness=0.02)
+    apart = np.linalg.norm((T - np.eye(4)) @ np.append(sensor, 1))
+    poses = {0: np.eye(4), 1: np.eye(4)}
+    assert expected_error(one, poses, shape, 20.0) == pytest.approx(np.hypot(apart, 0.4))
+
+
 @pytest.fixture(scope="module")
 def surfaces():
     """Six scans of one scene as surfaces, and one of another scene; true poses."""
@@ -438,7 +465,7 @@ def test_one_doubtful_edge_is_not_enough_and_silent_pairs_speak_against_it():
     assert overlaps.of(2, 1, inverse(truth[1]) @ truth[2]) > 0.9
     assert overlaps.of(2, 1, np.eye(4) + np.eye(4)[:, [3, 3, 3, 3]] * 0) < 0.9
     tried = {(0, 1), (0, 2), (1, 2)}
-    strict = GroupingRules(tolerance=0.2, near_tolerance=0.125, kept_tolerance=0.125, silent_worth=20.0)
+    strict = replace(RULES, silent_worth=20.0)
     assert [len(g.poses) for g in group_scans(shapes, sure, strict, tried, overlaps)] == [2, 1]
 
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from geomoe3d.batch.store import Outcome
-from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, shift_frames
+from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, shift_frames, transform_points
 from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
 
@@ -30,16 +30,20 @@ class Shape:
         center: (3,) mean.
         spread: (3, 3) covariance.
         origin: (3,) file coordinate = local + origin.
+        sensor: (3,) where the sensor stood, or the centre where that is not known.
     """
 
     center: FloatArray
     spread: FloatArray
     origin: FloatArray
+    sensor: FloatArray
 
     @classmethod
-    def of(cls, points: FloatArray, origin: FloatArray) -> Shape:
-        """From the voxel points of a scan (N, 3), N >= 1."""
-        return cls(points.mean(0), np.atleast_2d(np.cov(points.T, bias=True)), origin)
+    def of(cls, points: FloatArray, origin: FloatArray, sensor: FloatArray | None = None) -> Shape:
+        """From the voxel points of a scan (N, 3), N >= 1, and its sensor (3,), local coordinates."""
+        center = points.mean(0)
+        spread = np.atleast_2d(np.cov(points.T, bias=True))
+        return cls(center, spread, origin, center if sensor is None else sensor)
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class Edge:
         confidence: of the registration.
         information: (6, 6) about the target's local origin, order [rotation, translation], for the left
             perturbation; scaled so that its translation part counts matched points.
+        looseness: standard deviation of the source's sensor in the target, cloud units, if the gaps between
+            the surfaces were independent from point to point; they are not, see `GroupingRules`.
     """
 
     source: int
@@ -59,6 +65,7 @@ class Edge:
     T_target_source: FloatArray
     confidence: float
     information: FloatArray
+    looseness: float = 0.0
 
     @property
     def worth(self) -> float:
@@ -76,12 +83,14 @@ def edge_of(outcome: Outcome, source: int, target: int, shapes: list[Shape]) -> 
     T = shift_frames(result.T_target_source, -shapes[source].origin, -origin)
     matched = max(result.overlap * result.source.num_points, 1.0)
     information = _about_origin(result.information_matrix, result.information_center - origin)
+    sensor = transform_points(T, shapes[source].sensor[None])[0]
+    looseness = deviation_at(information, sensor)
     information *= matched / max(float(np.trace(result.information_matrix[3:, 3:])), 1e-12)
     # A surface that lets the source slide must not make the graph singular.
     floor = _LEAST_OBSERVABILITY * matched
     radius_squared = max(float(np.trace(shapes[source].spread)), 1e-12)
     information += floor * np.diag([radius_squared] * 3 + [1.0] * 3)
-    return Edge(source, target, T, result.confidence, information)
+    return Edge(source, target, T, result.confidence, information, looseness)
 
 
 def displacement(T_a: FloatArray, T_b: FloatArray, shape: Shape) -> float:
@@ -101,6 +110,23 @@ def agrees(T_a: FloatArray, T_b: FloatArray, shape: Shape, tolerance: float, max
     return rotation_angle_deg(T_a[:3, :3].T @ T_b[:3, :3]) < max_turn_deg
 
 
+def expected_error(edge: Edge, poses: dict[int, FloatArray], shape: Shape, correlation: float) -> float:
+    """By how much an edge may have the source's sensor in a wrong place, cloud units.
+
+    Two things tell: how far it differs from the poses, which other pairs have made too, and how loosely its
+    own surfaces hold the sensor, which stands at the end of a lever from what the two scans share.
+
+    Args:
+        edge: the registered pair.
+        poses: T_group_scan of both its scans.
+        shape: of the source.
+        correlation: by what the looseness is multiplied, see `GroupingRules`.
+    """
+    predicted = predicted_motion(edge.source, edge.target, poses)
+    apart = transform_points(predicted - edge.T_target_source, shape.sensor[None])[0]
+    return float(np.hypot(np.linalg.norm(apart), correlation * edge.looseness))
+
+
 def predicted_motion(source: int, target: int, poses: dict[int, FloatArray]) -> FloatArray:
     """T_target_source (4, 4) by the poses T_group_scan."""
     T: FloatArray = inverse(poses[target]) @ poses[source]
@@ -117,3 +143,12 @@ def _about_origin(information: FloatArray, center: FloatArray) -> FloatArray:
     A[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     moved: FloatArray = A.T @ information @ A
     return moved
+
+
+def deviation_at(information: FloatArray, point: FloatArray) -> float:
+    """Standard deviation of where a motion puts a point, from its information about the same origin."""
+    x, y, z = point
+    J = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])  # p + w x p + v
+    # Never singular: what nothing holds may be anywhere.
+    covariance = np.linalg.inv(information + 1e-12 * np.trace(information) * np.eye(6))
+    return float(np.sqrt(max(np.trace(J @ covariance @ J.T), 0.0)))

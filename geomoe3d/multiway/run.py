@@ -50,6 +50,7 @@ _MOST_SETTLINGS = 3
 _TOLERANCE = 4.0  # voxels; see GroupingRules
 _NEAR_TOLERANCE = 2.5
 _KEPT_TOLERANCE = 1.5
+_KEPT_ERROR = 3.0
 _CLOSING_OVERLAP = 0.3
 _CLOSING_PER_SCAN = 1
 
@@ -155,7 +156,7 @@ class _Room:
         self.scans, self.config, self.store, self.labour = scans, config, store, labour
         self.progress, self.say = progress, say
         self.voxel_size = float(config.voxel_size or 0.0)
-        tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE)
+        tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE, _KEPT_ERROR)
         self.rules = GroupingRules(*(tolerance * self.voxel_size for tolerance in tolerances))
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
@@ -171,7 +172,7 @@ class _Room:
         """Every scan on the common grid: where its points lie, and how similar it is to the others."""
         registrar = Registrar(self.config, cache=open_cache(self.labour.cache))
         features: dict[int, Float32Array] = {}
-        nowhere = Shape(np.zeros(3), np.zeros((3, 3)), np.zeros(3))
+        nowhere = Shape(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3))
         for number, scan in enumerate(self.scans):
             self.shapes.append(nowhere)
             try:
@@ -185,7 +186,7 @@ class _Room:
                 continue
             assert described.features is not None
             features[number] = described.features
-            self.shapes[number] = Shape.of(described.points, described.origin)
+            self.shapes[number] = Shape.of(described.points, described.origin, described.viewpoint)
             self.surfaces[number] = Surface.of(described)
         if len(features) < 2:
             raise InputError(f"fewer than 2 scans can be used: {'; '.join(self.unusable.values())}")

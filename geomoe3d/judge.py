@@ -20,8 +20,8 @@ from geomoe3d.verification import Evidence
 # answers have a median evidence score of 0.54 and a lead of 5.3, wrong ones 0.12 and 1.4, unrelated pairs
 # 0.06 and 1.4 (scripts/measure_registration.py prints them per pair). Not yet calibrated.
 _OFFSET = 3.5
-_EVIDENCE_SLOPE = 3.0
-_LEAD_SLOPE = 2.0
+_SLOPES = np.array([3.0, 2.0])
+_LEAST_SCORE = 1e-3
 _MOST_LEAD = 30.0
 _UNRIVALLED_LEAD = 3.0
 _LEAST_OBSERVABILITY = 0.005
@@ -101,7 +101,7 @@ def judge(
         ``ambiguous`` where the surfaces let the source slide, or where the evidence would do but another
         motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
-    confidence = confidence_score(evidence.score, lead)
+    confidence = confidence_score(evidence, lead)
     notes = []
     if evidence.overlap < _LOW_OVERLAP:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -119,7 +119,7 @@ def judge(
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     if (
         lead < 1 / config.ambiguity_ratio
-        and confidence_score(evidence.score, _UNRIVALLED_LEAD) >= config.min_confidence
+        and confidence_score(evidence, _UNRIVALLED_LEAD) >= config.min_confidence
     ):
         notes.append(
             f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "
@@ -148,9 +148,17 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
     return evidence.score / other.score if other.score > 0 else float("inf")
 
 
-def confidence_score(score: float, lead: float) -> float:
-    """Logistic score in (0, 1) of the evidence and of its lead; rises with both."""
-    if score <= 0:
+CONFIDENCE_INPUTS = ("log evidence", "log lead")
+"""What the confidence is made of, in the order of `confidence_inputs`."""
+
+
+def confidence_inputs(evidence: Evidence, lead: float) -> FloatArray:
+    """(2,) natural logarithms, clipped: of the evidence's score and of the answer's lead."""
+    return np.log([max(evidence.score, _LEAST_SCORE), min(max(lead, 0.5), _MOST_LEAD)])
+
+
+def confidence_score(evidence: Evidence, lead: float) -> float:
+    """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
+    if evidence.score <= 0:
         return 0.0
-    strength = _EVIDENCE_SLOPE * np.log(score) + _LEAD_SLOPE * np.log(min(max(lead, 0.5), _MOST_LEAD))
-    return float(1 / (1 + np.exp(-np.clip(_OFFSET + strength, -50, 50))))
+    return float(1 / (1 + np.exp(-(_OFFSET + confidence_inputs(evidence, lead) @ _SLOPES))))

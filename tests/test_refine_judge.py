@@ -323,13 +323,13 @@ def test_the_threshold_is_the_users(least: float) -> None:
 
 def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
     scores, leads = np.geomspace(1e-6, 50, 40), [*np.geomspace(0.5, 30, 20), np.inf]
-    table = np.array([[confidence_score(s, x) for x in leads] for s in scores])
+    table = np.array([[confidence_score(evidence(s), x) for x in leads] for s in scores])
     assert ((table >= 0) & (table <= 1)).all()
     assert (np.diff(table, axis=0) >= 0).all()
     assert (np.diff(table, axis=1) >= 0).all()
     assert table[0, 0] < 0.001
     assert table[-1, -1] > 0.999
-    assert confidence_score(0.0, np.inf) == confidence_score(-1.0, 5.0) == 0
+    assert confidence_score(evidence(0.0), np.inf) == confidence_score(evidence(-1.0), 5.0) == 0
 
 
 def test_lead_over_the_other() -> None:

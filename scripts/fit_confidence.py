@@ -1,0 +1,144 @@
+"""Fits the confidence: P(the answer is right) as a logistic function of what the clouds say of it.
+
+    python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 200] [--out runs/confidence.jsonl]
+
+FOLDER: posed fragments that are not those of a benchmark (generated rooms, recordings of one's own). Pairs
+are drawn by overlap as the two benchmarks mix them, unrelated ones from different scenes. Every pair is
+registered with the default configuration; its outcome goes to OUT, and what is there is not done again.
+Prints coefficients for `geomoe3d/judge.py`, cross-validated over scenes. Needs scikit-learn, which the
+package itself does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
+from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
+from geomoe3d.judge import CONFIDENCE_INPUTS, confidence_inputs
+from geomoe3d.registration import Registrar
+from geomoe3d.types import FloatArray
+from geomoe3d.verification import Evidence
+
+BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
+"""Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""
+UNRELATED_WEIGHT = 0.5
+
+
+def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str, str, list[Any] | None]]:
+    """(scene, source, target, true motion or None), the same for the same folders and counts."""
+    rng = np.random.default_rng(0)
+    by_scene: dict[str, list[PosedPair]] = {}
+    for folder in folders:
+        for pair in open_collection(folder).pairs:
+            by_scene.setdefault(f"{folder}/{pair.scene}", []).append(pair)
+    everything = [(scene, pair) for scene, pairs in sorted(by_scene.items()) for pair in pairs]
+    total = sum(share for _, _, share in BANDS)
+    chosen: list[tuple[str, str, str, list[Any] | None]] = []
+    for low, high, share in BANDS:
+        band = [e for e in everything if e[1].overlap is not None and low <= e[1].overlap < high]
+        for k in rng.permutation(len(band))[: round(count * share / total)]:
+            scene, pair = band[k]
+            chosen.append((scene, str(pair.source), str(pair.target), pair.T_target_source.tolist()))
+    names = sorted(by_scene)
+    for _ in range(unrelated):
+        a, b = rng.choice(len(names), 2, replace=False)
+        source, target = (by_scene[names[k]][rng.integers(len(by_scene[names[k]]))].source for k in (a, b))
+        chosen.append((f"{names[a]} {names[b]}", str(source), str(target), None))
+    return [chosen[k] for k in rng.permutation(len(chosen))]
+
+
+def measure(pairs: list[tuple[str, str, str, list[Any] | None]], out: Path) -> list[dict[str, Any]]:
+    """One record per pair; those in the file are kept."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    lines = out.read_text().splitlines() if out.exists() else []
+    known = {(r["source"], r["target"]): r for r in map(json.loads, lines)}
+    registrar = Registrar()
+    with out.open("a") as file:
+        for number, (scene, source, target, T) in enumerate(pairs):
+            if (source, target) in known:
+                continue
+            result = registrar.register(load_fragment(Path(source)), load_fragment(Path(target)))
+            found = result.T_target_source
+            right = T is not None and bool(
+                np.isfinite(found).all()
+                and rotation_error_deg(found, np.array(T)) < 15
+                and translation_error(found, np.array(T)) < 0.3
+            )
+            names = ("overlap", "agreement", "distinctiveness", "free_space_violation")
+            record = {
+                "scene": scene,
+                "source": source,
+                "target": target,
+                "related": T is not None,
+                "right": right,
+                "status": result.status,
+                "lead": 1 / result.alternative.relative_score if result.alternative else 3.0,
+                "inliers": result.num_inliers / max(result.num_correspondences, 1),
+                "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
+            }
+            known[(source, target)] = record
+            file.write(json.dumps(record) + "\n")
+            file.flush()
+            if number % 25 == 0:
+                print(f"{number} of {len(pairs)}", flush=True)
+    return [known[(source, target)] for _, source, target, _ in pairs]
+
+
+def expected_calibration_error(p: FloatArray, right: FloatArray, bins: int = 10) -> float:
+    """Mean distance of confidence and success over equally wide bins, weighted by count."""
+    which = np.minimum((p * bins).astype(int), bins - 1)
+    gaps = [(which == b).sum() * abs(p[which == b].mean() - right[which == b].mean()) for b in set(which)]
+    return float(sum(gaps) / len(p))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folders", nargs="+")
+    parser.add_argument("--pairs", type=int, default=500)
+    parser.add_argument("--unrelated", type=int, default=200)
+    parser.add_argument("--out", default="runs/confidence.jsonl")
+    given = parser.parse_args()
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.metrics import log_loss, roc_auc_score
+    from sklearn.model_selection import GroupKFold, cross_val_predict
+
+    records = measure(draw(given.folders, given.pairs, given.unrelated), Path(given.out))
+    records = [r for r in records if r["evidence"] is not None]
+    X = np.array([confidence_inputs(Evidence(**r["evidence"]), r["lead"]) for r in records])
+    y = np.array([r["right"] for r in records])
+    related = np.array([r["related"] for r in records])
+    weight = np.where(related, 1.0, UNRELATED_WEIGHT)
+    print(f"{related.sum()} related pairs, {y[related].mean():.1%} right; {(~related).sum()} unrelated")
+    model = LogisticRegression(C=10.0)
+    p = cross_val_predict(
+        model,
+        X,
+        y,
+        groups=[r["scene"] for r in records],
+        cv=GroupKFold(5),
+        method="predict_proba",
+        params={"sample_weight": weight},
+    )[:, 1]
+    print(
+        f"log loss {log_loss(y[related], p[related]):.4f}, AUROC {roc_auc_score(y[related], p[related]):.4f}"
+    )
+    print(f"calibration error {expected_calibration_error(p[related], y[related]):.4f}")
+    for least in (0.8, 0.85, 0.9, 0.95, 0.97):
+        above = related & (p > least)
+        print(
+            f"above {least}: {above.sum() / related.sum():.1%} of the related, {y[above].mean():.2%} right; "
+            f"{(p[~related] > least).mean():.2%} of the unrelated"
+        )
+    model.fit(X, y, sample_weight=weight)
+    print(f"{', '.join(CONFIDENCE_INPUTS)}: {np.round(model.coef_[0], 3).tolist()}")
+    print(f"offset: {model.intercept_[0]:.3f}")
+
+
+if __name__ == "__main__":
+    main()

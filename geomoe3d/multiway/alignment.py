@@ -20,7 +20,7 @@ from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3, trans
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
-_NUM_POINTS = 1000  # of each scan, asked about each neighbour
+_NUM_POINTS = 500  # of each scan, asked about each neighbour
 _LEAST_OVERLAP = 0.1
 _REACHES = (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5)  # voxels; one step each
 _NEIGHBORS_AGAIN = 5  # the step before which it is asked again who overlaps whom
@@ -139,7 +139,10 @@ class _System:
 
 
 def _overlapping(poses: Mapping[int, FloatArray], overlaps: Overlaps) -> list[tuple[int, int]]:
-    """Pairs (source, target), both ways, of scans that see the same by the poses."""
+    """Pairs (source, target), both ways, of scans that see the same by the poses.
+
+    All of them: with the nearest alone, scans of one place hold each other and let go of the next place.
+    """
     return [
         (source, target)
         for source in poses

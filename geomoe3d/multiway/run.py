@@ -161,6 +161,7 @@ class _Room:
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
         self.surfaces: dict[int, Surface] = {}
+        self.aligned: dict[tuple[tuple[int, bytes], ...], dict[int, FloatArray]] = {}
         self.overlaps = Overlaps({})
         self.similarity: FloatArray = np.zeros((0, 0))
         self.outcomes: dict[PairKey, Outcome] = {}
@@ -308,8 +309,13 @@ class _Room:
         return settle(group, edges, self.shapes, self.rules, self.align)
 
     def align(self, poses: dict[int, FloatArray]) -> dict[int, FloatArray]:
-        """The poses of a group laid on each other by the scans' surfaces."""
-        return align_scans(poses, self.surfaces, self.overlaps, self.voxel_size, seed=self.config.seed)
+        """The poses of a group laid on each other by the scans' surfaces; once, however often asked."""
+        key = tuple((scan, poses[scan].tobytes()) for scan in sorted(poses))
+        if key not in self.aligned:
+            self.aligned[key] = align_scans(
+                poses, self.surfaces, self.overlaps, self.voxel_size, seed=self.config.seed
+            )
+        return dict(self.aligned[key])
 
     # ---- the answer
 

@@ -1,6 +1,7 @@
 """Whole rooms from their fragments alone, scored against the dev half's published poses.
 
     python scripts/measure_multiway.py OUT [--scene NAME ...] [--scans N] [--workers N] [--set key=value ...]
+    python scripts/measure_multiway.py OUT --truth [--scene NAME ...]    how exact the published poses are
 
 Ground truth is used for scoring only. A fragment is placed rightly when its pose in the largest group is
 within 15 deg and 30 cm of the published one, after the group as a whole has been laid on it (rigid fit of the
@@ -19,7 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.config import load_config
+from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.threedmatch import find_benchmark_root, read_gt_log, true_motion
 from geomoe3d.evaluation.memory import PeakMemory
 from geomoe3d.geometry.rigid_fit import fit_rigid
@@ -27,12 +30,18 @@ from geomoe3d.geometry.se3 import (
     inverse,
     make_transform,
     rotation_error_deg,
+    shift_frames,
     transform_points,
     translation_error,
 )
 from geomoe3d.journal import read_journal
+from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.model import SceneGroup, SceneModel
+from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.run import MOST_ROUNDS, register_scans
+from geomoe3d.multiway.scans import choose_common_voxel_size, find_scans
+from geomoe3d.registration import Registrar
+from geomoe3d.stages import StageClock
 from geomoe3d.types import FloatArray
 
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -89,6 +98,32 @@ def align(ours: FloatArray, theirs: FloatArray) -> FloatArray:
     return T
 
 
+def truth_drift(files: list[Path], scene: str, config: RegistrationConfig) -> FloatArray:
+    """By how much each published pose moves (m) when the scans are laid on each other's surfaces from there.
+
+    What the surfaces do not hold stays, so this says how exact the published poses are, not how exact ours.
+    """
+    truth = max(true_poses(scene), key=len)
+    scans = [scan for scan in find_scans(files) if number(scan.name) in truth]
+    size = config.voxel_size or choose_common_voxel_size(scans, config.preparation)[0]
+    registrar, surfaces, poses, origins = Registrar(config), {}, {}, {}
+    for scan in scans:
+        cloud = load_points(scan.path)
+        view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
+        key = number(scan.name)
+        surfaces[key] = Surface.of(registrar.describe_cloud(cloud, size, view, StageClock()))
+        origins[key] = cloud.origin
+        poses[key] = shift_frames(truth[key], -cloud.origin, np.zeros(3))
+    overlaps = Overlaps({key: surface.points for key, surface in surfaces.items()})
+    for _ in range(3):
+        poses = align_scans(poses, surfaces, overlaps, size)
+    group = {str(key): shift_frames(T, origins[key], np.zeros(3)) for key, T in poses.items()}
+    ours = np.concatenate([transform_points(T, _CORNERS) for T in group.values()])
+    theirs = np.concatenate([transform_points(truth[int(name)], _CORNERS) for name in group])
+    T = align(ours, theirs)
+    return np.array([translation_error(T @ pose, truth[int(name)]) for name, pose in group.items()])
+
+
 def score(model: SceneModel, scene: str) -> dict[str, Any]:
     """All that is reported of one room."""
     parts = true_poses(scene)
@@ -134,12 +169,24 @@ def main() -> None:
     parser.add_argument("--pairs", default="auto", choices=("auto", "all", "similar"))
     parser.add_argument("--rounds", type=int, default=MOST_ROUNDS, help="of further pairs")
     parser.add_argument("--workers", type=int, help="local processes; default: this one")
+    parser.add_argument("--truth", action="store_true", help="how far the surfaces move the published poses")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="configuration")
     given = parser.parse_args()
     root = find_benchmark_root() / "fragments"
     scenes = sorted(
         p.name for p in root.iterdir() if not given.scene or any(s in p.name for s in given.scene)
     )
+    if given.truth:
+        for scene in scenes:
+            files = sorted((root / scene).glob("*.ply"), key=lambda path: number(path.stem))
+            moved = truth_drift(files, scene, load_config(None, given.set))
+            print(
+                f"{scene[:24]}: RMSE {100 * np.sqrt(np.mean(moved**2)):.1f} cm, median "
+                f"{100 * np.median(moved):.1f}, 95 % {100 * np.quantile(moved, 0.95):.1f}, largest "
+                f"{100 * moved.max():.1f}",
+                flush=True,
+            )
+        return
     print(
         "| scene | scans | placed | other groups | RMSE, median, 95 % (cm) | edges kept | wrong (gross) |",
         end="",

@@ -1,4 +1,4 @@
-"""From scans to one model: propose pairs, register them, group what agrees, ask again where scans are loose.
+"""From scans to one model: propose pairs, register, group and align what agrees, ask again where it is loose.
 
 Place: above registration and batch. All pairs of up to 30 scans are registered; of more, those whose scans
 look alike, then, for scans and groups still apart, their next most similar, and pairs that the poses found so
@@ -26,7 +26,7 @@ from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.journal import read_journal
 from geomoe3d.multiway.alignment import Surface, align_scans
-from geomoe3d.multiway.edges import Edge, Shape, agrees, edge_of, predicted_motion
+from geomoe3d.multiway.edges import Edge, Shape, agrees, edge_of, expected_error, predicted_motion
 from geomoe3d.multiway.grouping import Group, GroupingRules, group_scans, settle
 from geomoe3d.multiway.model import (
     EdgeReport,
@@ -366,8 +366,11 @@ class _Room:
         if a is None or b is None or a != b:
             return "not enough speaks for it to tie its two scans"
         predicted = predicted_motion(edge.source, edge.target, groups[a].poses)
-        shape = self.shapes[edge.source]
-        if agrees(predicted, edge.T_target_source, shape, self.rules.tolerance, self.rules.turn_deg):
+        shape, rules = self.shapes[edge.source], self.rules
+        if agrees(predicted, edge.T_target_source, shape, rules.kept_tolerance, rules.kept_turn_deg):
+            error = expected_error(edge, groups[a].poses, shape, rules.correlation)
+            return f"what its two scans share holds them too loosely: the sensor may be {error:.2g} off"
+        if agrees(predicted, edge.T_target_source, shape, rules.tolerance, rules.turn_deg):
             return "near the poses that the other pairs give, but not near enough"
         apart = float(
             np.linalg.norm(

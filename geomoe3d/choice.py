@@ -9,15 +9,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.answer import Findings
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.geometry.se3 import check_motion, shift_frames
+from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import Refiner
 from geomoe3d.stages import StageClock
-from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PreparedCloud
 from geomoe3d.verification import Evidence, Verifier, best_first, clearly_different, distinct
 
 _CLOSE_LEAD = 2.0
@@ -38,6 +39,7 @@ class Chooser:
 
     Args:
         described: source and target on one grid, with features.
+        matched: correspondences on this grid, of which a right answer has its share.
         threshold: largest distance of points on the same surface, cloud units.
         config: of the registration.
         clock: told of the stages verify, refine and judge.
@@ -46,11 +48,13 @@ class Chooser:
     def __init__(
         self,
         described: tuple[PreparedCloud, PreparedCloud],
+        matched: Correspondences,
         threshold: float,
         config: RegistrationConfig,
         clock: StageClock,
     ) -> None:
-        self._described, self._threshold, self._config, self._clock = described, threshold, config, clock
+        self._described, self._matched, self._threshold = described, matched, threshold
+        self._config, self._clock = config, clock
         clock("verify")
         self._verifier = Verifier(*described, threshold, seed=config.seed)
         self._refiner = Refiner(*described, config.refinement)
@@ -85,7 +89,8 @@ class Chooser:
         T, (source, target) = answer.T_target_source, self._described
         other, lead = self._rival(answer)
         information = measure_information(T, source, target, self._threshold)
-        judgement = judge(answer.evidence, lead, information, self._config.judgement)
+        support = self._support(T)
+        judgement = judge(answer.evidence, lead, support, information, self._config.judgement)
         findings = Findings(T, other, lead, answer.evidence, information, judgement)
         return findings if answer.note is None else findings.with_note(answer.note)
 
@@ -119,6 +124,13 @@ class Chooser:
                 other = clearly_different([moved], T, source, self._shift) or other
                 lead = lead_over(answer.evidence, other[1])
         return (other[0] if other else None), lead
+
+    def _support(self, T_target_source: FloatArray) -> float:
+        """Share of the correspondences that agree with a motion."""
+        if len(self._matched) == 0:
+            return 0.0
+        gaps = transform_points(T_target_source, self._matched.source) - self._matched.target
+        return float((np.linalg.norm(gaps, axis=1) < self._threshold).mean())
 
     @property
     def _shift(self) -> float:

@@ -127,7 +127,7 @@ class RefinementConfig(Section):
 class JudgementConfig(Section):
     """When an answer may be called ok."""
 
-    min_confidence: float = Field(0.9, ge=0, le=1, description="below it the status is low_confidence")
+    min_confidence: float = Field(0.95, ge=0, le=1, description="below it the status is low_confidence")
     ambiguity_ratio: float = Field(
         0.8, gt=0, le=1, description="a distinct second hypothesis this good makes the answer ambiguous"
     )

@@ -1,7 +1,8 @@
 """How sure: status, reasons and confidence from the evidence, and the information of the fit.
 
-Place: judge, the last step. The confidence is a documented score, not yet a calibrated probability: a
-logistic function of the evidence of the clouds and of its lead over the best clearly different motion.
+Place: judge, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
+the clouds, its lead over the best clearly different motion, the share of correspondences that agree, and the
+overlap.
 """
 
 from __future__ import annotations
@@ -16,12 +17,11 @@ from geomoe3d.result import Status
 from geomoe3d.types import FloatArray, PreparedCloud
 from geomoe3d.verification import Evidence
 
-# Chosen by hand on every 8th pair of the 3DMatch and 3DLoMatch dev half and 100 unrelated pairs, where right
-# answers have a median evidence score of 0.54 and a lead of 5.3, wrong ones 0.12 and 1.4, unrelated pairs
-# 0.06 and 1.4 (scripts/measure_registration.py prints them per pair). Not yet calibrated.
-_OFFSET = 3.5
-_SLOPES = np.array([3.0, 2.0])
-_LEAST_SCORE = 1e-3
+# Fitted by scripts/fit_confidence.py on 500 pairs of generated rooms and a recorded one, mixed by overlap as
+# the benchmarks are, and 250 unrelated ones; docs/measurements.md holds what came of it on real scans.
+_OFFSET = 7.14
+_SLOPES = np.array([2.68, 2.26, 1.81, -2.86])
+_LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
 _MOST_LEAD = 30.0
 _UNRIVALLED_LEAD = 3.0
 _LEAST_OBSERVABILITY = 0.005
@@ -86,6 +86,7 @@ def measure_information(
 def judge(
     evidence: Evidence,
     lead: float,
+    support: float,
     information: Information,
     config: JudgementConfig,
 ) -> Judgement:
@@ -94,6 +95,7 @@ def judge(
     Args:
         evidence: of the answer, after refinement.
         lead: as `lead_over` gives it.
+        support: share of the correspondences that agree with the answer.
         information: of the answer.
         config: thresholds.
 
@@ -101,7 +103,7 @@ def judge(
         ``ambiguous`` where the surfaces let the source slide, or where the evidence would do but another
         motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
-    confidence = confidence_score(evidence, lead)
+    confidence = confidence_score(evidence, lead, support)
     notes = []
     if evidence.overlap < _LOW_OVERLAP:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -119,7 +121,7 @@ def judge(
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     if (
         lead < 1 / config.ambiguity_ratio
-        and confidence_score(evidence, _UNRIVALLED_LEAD) >= config.min_confidence
+        and confidence_score(evidence, _UNRIVALLED_LEAD, support) >= config.min_confidence
     ):
         notes.append(
             f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "
@@ -148,17 +150,28 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
     return evidence.score / other.score if other.score > 0 else float("inf")
 
 
-CONFIDENCE_INPUTS = ("log evidence", "log lead")
+CONFIDENCE_INPUTS = ("log evidence", "log lead", "log support", "log overlap")
 """What the confidence is made of, in the order of `confidence_inputs`."""
 
 
-def confidence_inputs(evidence: Evidence, lead: float) -> FloatArray:
-    """(2,) natural logarithms, clipped: of the evidence's score and of the answer's lead."""
-    return np.log([max(evidence.score, _LEAST_SCORE), min(max(lead, 0.5), _MOST_LEAD)])
+def confidence_inputs(evidence: Evidence, lead: float, support: float) -> FloatArray:
+    """(4,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
+
+    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it.
+    """
+    return np.log(
+        [
+            max(evidence.score, _LEAST_SCORE),
+            min(max(lead, 0.5), _MOST_LEAD),
+            support + _LEAST_SUPPORT,
+            evidence.overlap + _LEAST_OVERLAP,
+        ]
+    )
 
 
-def confidence_score(evidence: Evidence, lead: float) -> float:
+def confidence_score(evidence: Evidence, lead: float, support: float) -> float:
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
     if evidence.score <= 0:
         return 0.0
-    return float(1 / (1 + np.exp(-(_OFFSET + confidence_inputs(evidence, lead) @ _SLOPES))))
+    strength = _OFFSET + confidence_inputs(evidence, lead, support) @ _SLOPES
+    return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

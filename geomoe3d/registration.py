@@ -148,7 +148,7 @@ class Registrar:
         described = self.describe(*clouds, voxel_size, clock)
         matched, weighed, hypotheses = self.propose(described, clock)
         with single_blas_thread():
-            chooser = Chooser(described, threshold, config, clock)
+            chooser = Chooser(described, matched, threshold, config, clock)
             chooser.consider(hypotheses)
             if initial is not None:
                 chooser.consider_guess(initial)

@@ -79,7 +79,7 @@ def measure(pairs: list[tuple[str, str, str, list[Any] | None]], out: Path) -> l
                 "right": right,
                 "status": result.status,
                 "lead": 1 / result.alternative.relative_score if result.alternative else 3.0,
-                "inliers": result.num_inliers / max(result.num_correspondences, 1),
+                "support": result.num_inliers / max(result.num_correspondences, 1),
                 "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
             }
             known[(source, target)] = record
@@ -110,7 +110,7 @@ def main() -> None:
 
     records = measure(draw(given.folders, given.pairs, given.unrelated), Path(given.out))
     records = [r for r in records if r["evidence"] is not None]
-    X = np.array([confidence_inputs(Evidence(**r["evidence"]), r["lead"]) for r in records])
+    X = np.array([confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"]) for r in records])
     y = np.array([r["right"] for r in records])
     related = np.array([r["related"] for r in records])
     weight = np.where(related, 1.0, UNRELATED_WEIGHT)

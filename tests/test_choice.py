@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.choice import Chooser
 from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.matching import match
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
@@ -34,7 +35,7 @@ def pair():
 
 def chooser(pair, *assignments: str) -> Chooser:
     config = load_config(None, list(assignments))
-    return Chooser(pair[0], 2 * VOXEL, config, StageClock())
+    return Chooser(pair[0], match(*pair[0], config.matching), 2 * VOXEL, config, StageClock())
 
 
 def off(T, degrees: float, shift: float) -> Hypothesis:

@@ -266,50 +266,50 @@ def evidence(score: float, overlap: float = 0.6, violation: float = 0.0) -> Evid
 
 
 def test_strong_evidence_with_a_lead_is_ok() -> None:
-    judged = judge(evidence(0.8), 5.0, FIRM, JudgementConfig())
+    judged = judge(evidence(0.8), 5.0, 0.05, FIRM, JudgementConfig())
     assert judged.status == "ok"
     assert judged.reasons == ()
     assert judged.confidence > 0.9
 
 
 def test_weak_evidence_is_low_confidence_and_says_so() -> None:
-    judged = judge(evidence(0.05), 1.5, FIRM, JudgementConfig())
+    judged = judge(evidence(0.05), 1.5, 0.05, FIRM, JudgementConfig())
     assert judged.status == "low_confidence"
-    assert judged.confidence < 0.9
-    assert any(re.search(r"confidence 0\.\d\d is below 0\.90", reason) for reason in judged.reasons)
+    assert judged.confidence < 0.95
+    assert any(re.search(r"confidence 0\.\d\d is below 0\.95", reason) for reason in judged.reasons)
 
 
 def test_a_rival_about_as_good_is_ambiguous() -> None:
-    judged = judge(evidence(0.8), 1.1, FIRM, JudgementConfig())
+    judged = judge(evidence(0.8), 1.1, 0.05, FIRM, JudgementConfig())
     assert judged.status == "ambiguous"
     assert judged.confidence <= 0.5
     assert any("91 %" in reason for reason in judged.reasons)
     limit = 1 / JudgementConfig().ambiguity_ratio
-    assert judge(evidence(2.0), limit * 1.001, FIRM, JudgementConfig()).status != "ambiguous"
-    assert judge(evidence(2.0), limit * 0.999, FIRM, JudgementConfig()).status == "ambiguous"
+    assert judge(evidence(2.0), limit * 1.001, 0.05, FIRM, JudgementConfig()).status != "ambiguous"
+    assert judge(evidence(2.0), limit * 0.999, 0.05, FIRM, JudgementConfig()).status == "ambiguous"
     # Where even without a rival nothing would be believed, the rival is not the reason.
-    assert judge(evidence(0.02), 1.1, FIRM, JudgementConfig()).status == "low_confidence"
+    assert judge(evidence(0.02), 1.1, 0.05, FIRM, JudgementConfig()).status == "low_confidence"
 
 
 def test_a_surface_that_slides_is_ambiguous_whatever_the_evidence() -> None:
     for score, lead in ((5.0, 30.0), (0.01, 1.0)):
-        judged = judge(evidence(score), lead, LOOSE, JudgementConfig())
+        judged = judge(evidence(score), lead, 0.05, LOOSE, JudgementConfig())
         assert judged.status == "ambiguous"
         assert judged.confidence <= 0.3
         assert any("slide" in reason for reason in judged.reasons)
 
 
 def test_little_overlap_and_violated_free_space_are_told_even_when_ok() -> None:
-    judged = judge(evidence(2.0, overlap=0.09), 10.0, FIRM, JudgementConfig())
+    judged = judge(evidence(2.0, overlap=0.09), 10.0, 0.05, FIRM, JudgementConfig())
     assert judged.status == "ok"
     assert any("overlap 9 %" in reason for reason in judged.reasons)
-    judged = judge(evidence(2.0, violation=0.12), 10.0, FIRM, JudgementConfig())
+    judged = judge(evidence(2.0, violation=0.12), 10.0, 0.05, FIRM, JudgementConfig())
     assert any("free space" in reason and "0.12" in reason for reason in judged.reasons)
 
 
 def test_nothing_scored_is_never_ok() -> None:
     for lead in (1.0, 3.0, np.inf):
-        judged = judge(evidence(0.0), lead, FIRM, JudgementConfig())
+        judged = judge(evidence(0.0), lead, 0.05, FIRM, JudgementConfig())
         assert judged.status == "low_confidence"
         assert judged.confidence == 0
 
@@ -317,19 +317,26 @@ def test_nothing_scored_is_never_ok() -> None:
 @pytest.mark.parametrize("least", [0.0, 0.5, 0.99])
 def test_the_threshold_is_the_users(least: float) -> None:
     for score, lead in itertools.product((0.05, 0.2, 0.5, 2.0), (1.5, 5.0)):
-        judged = judge(evidence(score), lead, FIRM, JudgementConfig(min_confidence=least))
+        judged = judge(evidence(score), lead, 0.05, FIRM, JudgementConfig(min_confidence=least))
         assert (judged.status == "ok") == (judged.confidence >= least)
 
 
 def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
     scores, leads = np.geomspace(1e-6, 50, 40), [*np.geomspace(0.5, 30, 20), np.inf]
-    table = np.array([[confidence_score(evidence(s), x) for x in leads] for s in scores])
+    table = np.array([[confidence_score(evidence(s), x, 0.05) for x in leads] for s in scores])
     assert ((table >= 0) & (table <= 1)).all()
     assert (np.diff(table, axis=0) >= 0).all()
     assert (np.diff(table, axis=1) >= 0).all()
     assert table[0, 0] < 0.001
     assert table[-1, -1] > 0.999
-    assert confidence_score(evidence(0.0), np.inf) == confidence_score(evidence(-1.0), 5.0) == 0
+    assert confidence_score(evidence(0.0), np.inf, 0.05) == confidence_score(evidence(-1.0), 5.0, 0.05) == 0
+
+
+def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:
+    by_support = [confidence_score(evidence(0.2), 2.0, x) for x in (0, 0.005, 0.02, 0.3)]
+    by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05) for x in (0.1, 0.3, 0.9)]
+    assert by_support == sorted(set(by_support))
+    assert by_overlap == sorted(set(by_overlap), reverse=True)
 
 
 def test_lead_over_the_other() -> None:

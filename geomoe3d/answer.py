@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -130,6 +131,12 @@ def failed_result(
 
 def library_versions() -> dict[str, str]:
     """Versions of geomoe3d and of the installed libraries that decide numbers."""
+    return dict(_library_versions())
+
+
+@lru_cache(maxsize=1)
+def _library_versions() -> tuple[tuple[str, str], ...]:
+    """Read once: asking the installation takes some 20 ms."""
     from geomoe3d import __version__
 
     versions = {"geomoe3d": __version__}
@@ -138,7 +145,7 @@ def library_versions() -> dict[str, str]:
             versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    return versions
+    return tuple(versions.items())
 
 
 def _alternative(findings: Findings, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:

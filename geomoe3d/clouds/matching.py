@@ -6,13 +6,17 @@ time; O(n m) time: 5,000 against 5,000 points take some 0.1 s, 30,000 against 30
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
+from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
 
 _BLOCK_ENTRIES = 12_000_000
+_SMALL_ENTRIES = 100_000_000  # up to 10,000 against 10,000 points one thread is about as fast as two
 
 
 def match(
@@ -31,7 +35,9 @@ def match(
     """
     if source.features is None or target.features is None:
         raise InputError("match needs described clouds; call describe(cloud, config) on both first")
-    index, distance, ratio, mutual = nearest_features(source.features, target.features, config.neighbors)
+    small = len(source) * len(target) <= _SMALL_ENTRIES
+    with single_blas_thread() if small else nullcontext():
+        index, distance, ratio, mutual = nearest_features(source.features, target.features, config.neighbors)
     rows = np.repeat(np.arange(len(source)), index.shape[1])
     columns, mutual = index.ravel(), mutual.ravel()
     keep: BoolArray = np.ones(len(rows), dtype=np.bool_)

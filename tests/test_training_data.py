@@ -136,6 +136,8 @@ def test_shards_give_back_what_was_written(tmp_path: Path) -> None:
         assert folder[i].ratio is None
     with pytest.raises(IndexError):
         folder[7]
+    sizes = [pair.voxel_size for pair in pairs]
+    assert folder.voxel_sizes() == (min(sizes), max(sizes))
     before = folder.identity()
     write_shard(tmp_path / "d", pairs[:1])
     assert ShardFolder(tmp_path).identity() != before

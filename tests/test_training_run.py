@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
 from geomoe3d.filters.pretrained import load_pretrained
 from geomoe3d.training.batches import make_sample, training_loader
-from geomoe3d.training.checkpoint import load_checkpoint
+from geomoe3d.training.checkpoint import load_checkpoint, save_checkpoint
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.logs import CsvLog, read_csv
 from geomoe3d.training.measures import evaluate, label_measures, motion_found
@@ -190,6 +191,41 @@ def test_step_without_finite_gradient_changes_nothing_and_is_counted(tmp_path: P
     assert updated
 
 
+def test_one_skipped_step_spoils_neither_the_log_nor_the_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from geomoe3d.cli import train_display
+
+    monkeypatch.setattr(train_display, "_PLAIN_EVERY_S", 0.0)
+    step = Updater.step
+    calls = []
+
+    def failing(self: Updater, *arguments: Any) -> tuple[bool, dict[str, float]]:
+        updated, measures = step(self, *arguments)
+        calls.append(updated)
+        bad = len(calls) in (1, 4)
+        return (False, dict.fromkeys(measures, float("nan"))) if bad else (updated, measures)
+
+    monkeypatch.setattr(Updater, "step", failing)
+    with train_display.Display() as display:
+        TrainingRun(config_of(), tmp_path).train(display)
+    (shown,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("step 6/6")]
+    assert "nan" not in shown
+    rows = read_csv(tmp_path / "train.csv")
+    assert [int(row["skipped"]) for row in rows] == [1, 2, 2]
+    assert all(np.isfinite(float(row["loss"])) for row in rows)
+
+
+def test_going_on_with_another_number_of_processes_is_refused(tmp_path: Path) -> None:
+    run = TrainingRun(config_of(), tmp_path)
+    run.train(Silent(), until=2)
+    state = load_checkpoint(tmp_path / "last.pt")
+    own = {k: v for k, v in state.items() if k not in {"format", "version", "config", "data", "commit"}}
+    save_checkpoint(tmp_path / "last.pt", {**own, "world": 2}, run.config, run.pairs.identity())
+    with pytest.raises(CheckpointError, match="by 2 processes, now 1"):
+        TrainingRun(config_of(), tmp_path)
+
+
 def test_run_of_skipped_steps_ends_with_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = TrainingRun(config_of(max_skipped_in_row=3), tmp_path)
     monkeypatch.setattr(Updater, "step", lambda *_: (False, {"loss": float("nan")}))
@@ -234,6 +270,9 @@ def test_run_starts_from_given_weights(tmp_path: Path) -> None:
     wide = {**TREE["network"], "width": 32}  # type: ignore[dict-item]
     with pytest.raises(CheckpointError, match="another architecture"):
         TrainingRun(config_of(init_from=str(weights), network=wide), tmp_path / "c")
+    run.train(Silent(), until=1)
+    weights.unlink()  # a run that goes on no longer needs them
+    assert TrainingRun(config_of(init_from=str(weights)), tmp_path / "b").progress.step == 1
 
 
 def test_training_from_shards_with_workers(tmp_path: Path) -> None:
@@ -249,6 +288,10 @@ def test_training_from_shards_with_workers(tmp_path: Path) -> None:
         folder = tmp_path / f"run{workers}"
         TrainingRun(config_of(data=data, workers=workers, steps=3), folder).train(Silent())
         results.append(read_csv(folder / "validation.csv"))
+        _, card = load_pretrained(folder / "weights.safetensors")
+        sizes = [source[i].voxel_size for i in range(5)]
+        assert card.voxel_size is not None
+        assert list(card.voxel_size) == [min(sizes), max(sizes)]
     for a, b in zip(*results, strict=True):
         assert {k: float(v) for k, v in a.items()} == pytest.approx(
             {k: float(v) for k, v in b.items()}, abs=0.05

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from types import TracebackType
@@ -61,8 +62,11 @@ class Display:
         if self._quiet:
             return
         for name in _SHOWN:
-            old = self._means.get(name, measures[name])
-            self._means[name] = 0.95 * old + 0.05 * measures[name]
+            old, new = self._means.get(name, math.nan), measures[name]
+            if math.isfinite(new):  # a skipped step must not blot out all later means
+                self._means[name] = 0.95 * old + 0.05 * new if math.isfinite(old) else new
+            else:
+                self._means.setdefault(name, math.nan)
         self._pace(step)
         self._last = (step, pairs_per_s, skipped)
         if self._live is not None:

@@ -96,12 +96,14 @@ class FragmentPool:
         self.seed = seed
         self._paths = shard_folders(self.folder)
         self._open: dict[int, DescribedScene] = {}
-        overlaps, owners, places = [], [], []
+        overlaps, owners, places, voxels = [], [], [], []
         for number, path in enumerate(self._paths):
             scene = open_shard(path, verify=verify)
             overlaps.append(np.array(scene.overlap))
             owners.append(np.full(len(scene.pair), number))
             places.append(np.arange(len(scene.pair)))
+            voxels.append(scene.voxel_size)
+        self.voxel_sizes = min(voxels), max(voxels)
         self.overlap = np.concatenate(overlaps)
         self._owner, self._place = np.concatenate(owners), np.concatenate(places)
         edges = self.settings.bands

@@ -43,6 +43,10 @@ class FragmentPairs:
         """Changes with the shards, the settings and the seed."""
         return self.pool.identity()
 
+    def voxel_sizes(self) -> tuple[float, float]:
+        """Least and largest of all scenes, metres."""
+        return self.pool.voxel_sizes
+
 
 def as_training_pair(pair: DrawnPair) -> TrainingPair:
     """A drawn pair as training takes it; coordinates in single precision."""

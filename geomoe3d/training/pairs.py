@@ -1,8 +1,8 @@
 """What training reads: correspondences with labels and the true motion, one pair at a time.
 
-A pair dataset is anything with ``len()``, ``[index]`` and ``identity()``. `ShardFolder` reads pairs that
-were written to disk, mapped into memory so that a data set larger than memory costs only what is touched.
-`geomoe3d.training.synthetic` makes them up.
+A pair dataset is anything with ``len()``, ``[index]``, ``identity()`` and ``voxel_sizes()``. `ShardFolder`
+reads pairs that were written to disk, mapped into memory so that a data set larger than memory costs only
+what is touched. `geomoe3d.training.synthetic` makes them up.
 """
 
 from __future__ import annotations
@@ -74,6 +74,9 @@ class PairDataset(Protocol):
     def identity(self) -> str:
         """Short text that changes when the data change; stored in checkpoints and weight cards."""
 
+    def voxel_sizes(self) -> tuple[float, float]:
+        """Least and largest voxel size of its pairs; stored in weight cards."""
+
 
 class ShardFolder:
     """Pairs of a folder of shards, in the order of the shards' names.
@@ -130,6 +133,12 @@ class ShardFolder:
             files = sorted(path.iterdir()) if path.is_dir() else [path]
             digest.update(json.dumps([[f.name, f.stat().st_size] for f in files]).encode())
         return f"shards:{self.folder.name}:{len(self)}:{digest.hexdigest()[:12]}"
+
+    def voxel_sizes(self) -> tuple[float, float]:
+        """Least and largest of all pairs."""
+        found = [_read(path, ("voxel_size",)).get("voxel_size", np.zeros(0)) for path in self._paths]
+        sizes = np.concatenate(found)
+        return float(sizes.min()), float(sizes.max())
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": {}}  # workers open the files themselves

@@ -81,6 +81,10 @@ class SyntheticPairs:
         """Seed and settings."""
         return f"synthetic:3:{self.seed}:{self.config.model_dump_json()}"
 
+    def voxel_sizes(self) -> tuple[float, float]:
+        """The range that they are drawn from."""
+        return self.config.voxel_size
+
 
 def generate_pair(rng: np.random.Generator, config: SyntheticConfig) -> TrainingPair:
     """One pair with about the drawn share of true matches (chance hits are labelled true as well)."""

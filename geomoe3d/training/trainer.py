@@ -10,6 +10,7 @@ on from last.pt. Under torchrun every process runs this; the first one writes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,7 +71,7 @@ class TrainingRun:
         self.pairs = open_training(config)
         torch.manual_seed(config.seed)
         self.model = GeoMoE(config.network)
-        if config.init_from is not None:
+        if config.init_from is not None and not self.last_path.exists():
             self._start_from(config.init_from)
         self.model.checkpoint_activations = config.checkpoint_activations
         self.model.to(self.device).train()
@@ -133,9 +134,10 @@ class TrainingRun:
                 self.averaged.update(self.model)
             rate.tick()
             for name, value in measures.items():
-                total = progress.meters.setdefault(name, [0.0, 0.0])
-                total[0] += value
-                total[1] += 1
+                if math.isfinite(value):  # else a skipped step, which is counted, would hide the others
+                    total = progress.meters.setdefault(name, [0.0, 0.0])
+                    total[0] += value
+                    total[1] += 1
             done = progress.step >= config.steps
             if self.process.is_first:
                 reporter.stepped(progress.step, measures, rate.value, progress.skipped)
@@ -202,6 +204,7 @@ class TrainingRun:
             progress = self.progress
             state = {
                 "step": progress.step,
+                "world": self.process.world,
                 "skipped": progress.skipped,
                 "skipped_in_row": progress.skipped_in_row,
                 "best_step": progress.best_step,
@@ -218,6 +221,11 @@ class TrainingRun:
     def _resume(self) -> None:
         state = load_checkpoint(self.last_path)
         check_same_run(state, self.config, self.pairs.identity(), self.last_path)
+        if (world := state.get("world", self.process.world)) != self.process.world:
+            raise CheckpointError(
+                f"'{self.last_path}' was trained by {world} processes, now {self.process.world}: each step "
+                f"would see another number of pairs; start as many as before"
+            )
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.averaged is not None:
@@ -240,10 +248,9 @@ class TrainingRun:
         best = load_checkpoint(self.best_path)
         model = GeoMoE(self.config.network)
         model.load_state_dict(best["model"])
-        data = self.config.data
         card = WeightCard(
             architecture={},
-            voxel_size=data.synthetic.voxel_size if data.train == "synthetic" else None,
+            voxel_size=self.pairs.voxel_sizes(),
             training_data=self.pairs.identity(),
             steps=int(best["step"]),
             metrics=best["metrics"],

@@ -55,6 +55,14 @@ def test_splits_have_the_published_sizes() -> None:
     assert split_of("somewhere") is None
 
 
+def test_split_of_names_with_sequences() -> None:
+    assert split_of("7-scenes-chess@seq-01") == split_of("sun3d-brown_cs_2-brown_cs2_0") == "train"
+    assert split_of("rgbd-scenes-v2-scene_10") == "validation"
+    assert split_of("rgbd-scenes-v2-scene_10_1") == "validation"
+    assert split_of("7-scenes-redkitchen") == "test"
+    assert split_of("elsewhere_1") is None
+
+
 def test_posed_folder(tmp_path: Path) -> None:
     posed_scene(tmp_path / "kitchen")
     posed_scene(tmp_path / "hall", 4)

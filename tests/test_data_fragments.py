@@ -192,6 +192,41 @@ def test_conventions_agree(tmp_path: Path) -> None:
         open_recording(tmp_path / "plain")
 
 
+@pytest.mark.filterwarnings("error")
+def test_broken_lists_and_poses_are_named(tmp_path: Path) -> None:
+    write_recording(tmp_path / "seven", 3)
+    (tmp_path / "seven" / "frame-000001.pose.txt").write_text("")
+    recording = open_recording(tmp_path / "seven")
+    assert len(recording.frames) == 2
+    assert "holds no numbers" in recording.skipped[0]
+    tum = tmp_path / "tum"
+    tum.mkdir()
+    np.savetxt(tum / "K.txt", K)
+    (tum / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match=r"depth\.txt"):
+        open_recording(tum, convention="tum")
+    (tum / "depth.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="no text file"):
+        open_recording(tum)
+    (tum / "depth.txt").write_text("1.0 depth/0.png\nabc depth/1.png\n2.0\n")
+    recording = open_recording(tum)
+    assert len(recording.frames) == 1
+    assert [line[:16] for line in recording.skipped] == ["depth.txt line 2", "depth.txt line 3"]
+
+
+def test_lengths_must_be_positive(tmp_path: Path) -> None:
+    write_recording(tmp_path / "frames", 3)
+    recording = open_recording(tmp_path / "frames")
+    for settings in (FusionSettings(voxel_size=0), FusionSettings(max_depth=-1)):
+        with pytest.raises(InputError, match="must be positive"):
+            make_fragments(recording, tmp_path / "out", frames_per_fragment=3, settings=settings)
+    with pytest.raises(InputError, match="the grid must be positive"):
+        make_fragments(recording, tmp_path / "out", frames_per_fragment=3, grid=0.0)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="focal lengths"):
+        open_recording(tmp_path / "frames", intrinsics=np.zeros((3, 3)))
+
+
 def test_runs() -> None:
     frames = [Frame(Path(str(k)), np.eye(4)) for k in range(12)]
     assert [len(run) for run in split_runs(frames, 5)] == [5, 5]

@@ -28,7 +28,7 @@ from geomoe3d.data.rooms.solids import Solids
 from geomoe3d.data.rooms.walk import WalkSettings, camera_pose, drifted, frame_poses, walk
 from geomoe3d.data.settings import SynthesisSettings
 from geomoe3d.data.synthesize import Job, make_scene, scene_name, synthesize
-from geomoe3d.errors import ConfigError, InputError, OutputError
+from geomoe3d.errors import ConfigError, FormatError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, transform_points
 
 TINY = SynthesisSettings(fragments_per_scene=2, frames_per_fragment=2, fusion_voxel=0.03, min_points=500)
@@ -448,6 +448,10 @@ def test_missing_material(tmp_path: Path) -> None:
         open_library([tmp_path / "empty"])
     with pytest.raises(InputError, match="does not exist"):
         synthesize(tmp_path / "set", 1, settings=TINY, meshes=[str(tmp_path / "absent.ply")])
+    (tmp_path / "broken.ply").write_text("ply\nbroken")
+    with pytest.raises(FormatError, match=r"broken\.ply' cannot be read"):
+        synthesize(tmp_path / "set", 1, settings=TINY, meshes=[str(tmp_path / "broken.ply")])
+    assert not (tmp_path / "set").exists()  # not bound to a file that has to change
 
 
 def test_whole_scene_mesh(tmp_path: Path) -> None:

@@ -299,3 +299,15 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(geomoe3d, "geomoe3d", arguments) == 0
     assert "1 shards made (3 fragments, 3 pairs)" in capsys.readouterr().out
     assert run(geomoe3d, "geomoe3d", [*arguments, "--group", "train_info"]) == 2
+    (tmp_path / "posed" / "a" / "cloud_bin_1.ply").write_text("broken")
+    alone = ["data", "features", str(tmp_path / "posed"), str(tmp_path / "none"), "--min-overlap", "2"]
+    assert run(geomoe3d, "geomoe3d", alone) == 2
+    assert "0 shards made" in capsys.readouterr().out
+
+
+def test_split_leaves_out_the_other_scenes(tmp_path: Path) -> None:
+    for scene in ("7-scenes-chess_1", "7-scenes-heads", "7-scenes-redkitchen"):
+        posed_scene(tmp_path / "posed" / scene)
+    report = describe_collection(tmp_path / "posed", tmp_path / "out", split="train")
+    assert report.made == 1
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["7-scenes-chess_1"]

@@ -217,16 +217,29 @@ def synthesize(
 @click.argument("out", type=click.Path())
 @click.option("--group", "groups", multiple=True, help="List of pairs to take, e.g. train_info; repeatable.")
 @click.option("--scene", "scenes", multiple=True, help="Scene to take (default: all); repeatable.")
+@click.option(
+    "--split",
+    type=click.Choice(("train", "validation", "test")),
+    help="Take the scenes of a published split of 3DMatch alone (default: all scenes).",
+)
 @click.option("--min-overlap", default=0.1, show_default=True, help="Least overlap of a pair.")
 @click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
 @traceback_option
+@click.pass_context
 def features(
-    root: str, out: str, groups: tuple[str, ...], scenes: tuple[str, ...], min_overlap: float, workers: int
+    context: click.Context,
+    root: str,
+    out: str,
+    groups: tuple[str, ...],
+    scenes: tuple[str, ...],
+    split: str | None,
+    min_overlap: float,
+    workers: int,
 ) -> None:
     """Describe the fragments of ROOT once, into the shards OUT that training reads.
 
     ROOT is any folder that 'geomoe3d data check' knows. Started again, it goes on; a shard that no longer
-    fits its fragments or settings is refused. Train with data.train=OUT.
+    fits its fragments or settings is refused. Train with data.train=OUT. Exit code 2 when OUT got no shard.
     """
     from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
     from geomoe3d.data.describe import describe_collection
@@ -237,6 +250,7 @@ def features(
             out,
             groups=groups or None,
             scenes=scenes or None,
+            split=split,
             min_overlap=min_overlap,
             workers=workers,
             progress=advance,
@@ -247,3 +261,4 @@ def features(
         f"{report.made} shards made ({report.num_fragments} fragments, {report.num_pairs} pairs), "
         f"{report.kept} kept, in {out}"
     )
+    context.exit(0 if report.made or report.kept else BAD_INPUT)

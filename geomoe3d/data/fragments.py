@@ -63,13 +63,19 @@ def make_fragments(
         progress: called with (fragments done, all).
 
     Raises:
-        InputError: fewer than 2 frames per fragment, or no fragment came of the frames.
+        InputError: fewer than 2 frames per fragment, a length that is not positive, or no fragment came of
+            the frames.
         OutputError: the folder holds files, or cannot be written.
     """
     from geomoe3d.clouds.io import save_points
 
     if frames_per_fragment < 2:
         raise InputError(f"a fragment needs at least 2 frames, found {frames_per_fragment}")
+    used = settings or FusionSettings()
+    lengths = {"voxel size": used.voxel_size, "truncation": used.truncation, "greatest depth": used.max_depth}
+    for name, length in (lengths if grid is None else {**lengths, "grid": grid}).items():
+        if not 0 < length < float("inf"):
+            raise InputError(f"the {name} must be positive and finite, found {length}")
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -83,7 +89,7 @@ def make_fragments(
     clouds: list[FloatArray] = []
     poses: list[FloatArray] = []
     for number, run in enumerate(runs):
-        points, pose = fuse_run(recording, run, size, settings or FusionSettings(), report.skipped)
+        points, pose = fuse_run(recording, run, size, used, report.skipped)
         if grid is not None:
             points = thin(points, grid)
         if len(points) < 100 or pose is None:

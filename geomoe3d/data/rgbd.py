@@ -93,6 +93,8 @@ def open_recording(
             f"'{folder}' holds no frame with a usable pose" + (f" ({reasons})" if reasons else "")
         )
     K = _read_intrinsics(folder) if intrinsics is None else np.asarray(intrinsics, dtype=np.float64)
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise InputError(f"focal lengths must be positive and finite, found intrinsics {K.tolist()}")
     scale = _PER_METRE[convention] if per_metre is None else per_metre
     if not scale > 0:
         raise InputError(f"depth values per metre must be positive, found {scale}")
@@ -152,12 +154,23 @@ def _find_convention(folder: Path) -> str:
 
 
 def _numbers(path: Path) -> NDArray[np.float64]:
+    lines = [line.split("#")[0] for line in _text(path).splitlines()]
+    lines = [line for line in lines if line.strip()]
+    if not lines:
+        raise FormatError(f"'{path}' holds no numbers")
     try:
-        return np.atleast_2d(np.loadtxt(path, delimiter="," if "," in path.read_text()[:4000] else None))
+        return np.atleast_2d(np.loadtxt(lines, delimiter="," if "," in lines[0] else None))
+    except ValueError as error:
+        raise FormatError(f"'{path}' holds no table of numbers: {error}") from None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
-    except (ValueError, UnicodeDecodeError) as error:
-        raise FormatError(f"'{path}' holds no table of numbers: {error}") from None
+    except UnicodeDecodeError:
+        raise FormatError(f"'{path}' is no text file") from None
 
 
 def _read_intrinsics(folder: Path) -> FloatArray:
@@ -249,11 +262,15 @@ def _tum(folder: Path, skipped: list[str]) -> list[Frame]:
         raise FormatError(f"'{folder / 'groundtruth.txt'}' has {poses.shape[1]} columns, expected 8")
     poses = poses[np.argsort(poses[:, 0])]
     frames = []
-    for line in (folder / "depth.txt").read_text().splitlines():
+    for number, line in enumerate(_text(folder / "depth.txt").splitlines(), start=1):
         words = line.split()
-        if len(words) != 2 or line.startswith("#"):
+        if not words or line.startswith("#"):
             continue
-        time, path = float(words[0]), folder / words[1]
+        try:
+            time, path = float(words[0]), folder / words[1]
+        except (IndexError, ValueError):
+            skipped.append(f"depth.txt line {number}: no 'time file': '{line}'")
+            continue
         right = int(np.clip(np.searchsorted(poses[:, 0], time), 1, len(poses) - 1)) if len(poses) > 1 else 0
         near = min((max(right - 1, 0), right), key=lambda k: abs(poses[k, 0] - time))
         gap = abs(poses[near, 0] - time)

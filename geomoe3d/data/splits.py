@@ -71,6 +71,8 @@ TEST_FRAGMENTS = {scene: counts[0] for scene, counts in _TEST.items()}
 TEST_PAIRS = {scene: counts[1] for scene, counts in _TEST.items()}
 """Pairs of 3DMatch; 1,623 in all."""
 
+SPLITS = ("train", "validation", "test")
+
 PUBLISHED_PAIRS = {"3DMatch": 1623, "3DLoMatch": 1781, "train_info": 20642, "val_info": 1331}
 """Benchmarks, and Predator's lists of training and validation pairs."""
 
@@ -78,10 +80,13 @@ PUBLISHED_PAIRS = {"3DMatch": 1623, "3DLoMatch": 1781, "train_info": 20642, "val
 def split_of(scene: str) -> str | None:
     """``train``, ``validation``, ``test``, or None for a scene that 3DMatch does not have.
 
-    Names may carry the sequence that the training archive appends (``scene@seq-01``).
+    Names may carry the sequence that the training archive (``scene@seq-01``) or Predator (``scene_1``)
+    appends.
     """
-    name = scene.split("@")[0]
-    for split, scenes in (("train", TRAIN_SCENES), ("validation", VALIDATION_SCENES), ("test", TEST_SCENES)):
-        if name in scenes:
-            return split
+    whole = scene.split("@")[0]
+    stem, _, number = whole.rpartition("_")
+    for name in (whole, stem) if number.isdigit() else (whole,):
+        for split, scenes in zip(SPLITS, (TRAIN_SCENES, VALIDATION_SCENES, TEST_SCENES), strict=True):
+            if name in scenes:
+                return split
     return None

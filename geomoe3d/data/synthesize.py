@@ -26,6 +26,7 @@ import numpy as np
 from geomoe3d.data.fragments import relate
 from geomoe3d.data.record import choose_scene, record
 from geomoe3d.data.rooms.models import ModelLibrary, open_library
+from geomoe3d.data.rooms.scenes import load_mesh_scene
 from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
@@ -118,6 +119,7 @@ def synthesize(
     Raises:
         InputError: the folder was made from another seed, settings or material; names what differs. Or a
             model folder or mesh is missing.
+        FormatError: a mesh cannot be read.
         OutputError: the folder cannot be written, or a worker died.
     """
     if num_scenes < 1 or workers < 1:
@@ -130,6 +132,8 @@ def synthesize(
     missing = [path for path in job.meshes if not Path(path).is_file()]
     if missing:
         raise InputError(f"scene mesh '{missing[0]}' does not exist")
+    for path in job.meshes:
+        load_mesh_scene(path)  # now, not hours later, when the folder is bound to this file
     library = _open_library(job)
     _open_folder(folder, _manifest(job))
     todo = [number for number in range(num_scenes) if not (folder / scene_name(number)).is_dir()]

@@ -21,7 +21,7 @@ from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
 from geomoe3d.filters.pretrained import load_pretrained
 from geomoe3d.training.batches import make_sample, training_loader
-from geomoe3d.training.checkpoint import load_checkpoint, save_checkpoint
+from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.logs import CsvLog, read_csv
 from geomoe3d.training.measures import evaluate, label_measures, motion_found
@@ -224,6 +224,13 @@ def test_going_on_with_another_number_of_processes_is_refused(tmp_path: Path) ->
     save_checkpoint(tmp_path / "last.pt", {**own, "world": 2}, run.config, run.pairs.identity())
     with pytest.raises(CheckpointError, match="by 2 processes, now 1"):
         TrainingRun(config_of(), tmp_path)
+
+
+def test_checkpoint_with_settings_of_another_version_is_refused_by_name(tmp_path: Path) -> None:
+    config = config_of()
+    state = {"config": json.dumps({**config.model_dump(), "network": {"num_towers": 3}}), "data": ""}
+    with pytest.raises(CheckpointError, match=r"another version.*network\.num_towers"):
+        check_same_run(state, config, "", tmp_path / "last.pt")
 
 
 def test_run_of_skipped_steps_ends_with_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

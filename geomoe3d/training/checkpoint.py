@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ValidationError
 
 from geomoe3d.errors import CheckpointError
 from geomoe3d.files import write_atomically
@@ -64,7 +65,14 @@ def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: 
     Raises:
         CheckpointError: names what differs.
     """
-    before = TrainConfig.model_validate_json(state["config"])
+    try:
+        before = TrainConfig.model_validate_json(state["config"])
+    except ValidationError as error:
+        keys = ", ".join(".".join(map(str, e["loc"])) for e in error.errors())
+        raise CheckpointError(
+            f"'{path}' was made by another version of geomoe3d, whose settings this one does not know "
+            f"({keys}); train into another folder"
+        ) from None
     changed = [key for key in _differences(before.model_dump(), config.model_dump()) if not _is_free(key)]
     if changed:
         raise CheckpointError(

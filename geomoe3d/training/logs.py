@@ -70,7 +70,7 @@ class TensorBoardLog:
 
 
 def draw_curves(folder: Path) -> Path:
-    """Draw losses, label measures, registration recall and expert usage of a run as ``curves.png``."""
+    """Draw losses, label measures, registration recall and expert balance of a run as ``curves.png``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

@@ -305,6 +305,18 @@ def test_training_from_shards_with_workers(tmp_path: Path) -> None:
         )
 
 
+def test_validation_on_generated_pairs_only_is_said_when_training_is_on_others(tmp_path: Path) -> None:
+    from geomoe3d.training.pairs import write_shard
+
+    (tmp_path / "shards").mkdir()
+    write_shard(tmp_path / "shards" / "a", [SyntheticPairs(SyntheticConfig())[0]])
+    folder = str(tmp_path / "shards")
+    said = TrainingRun(config_of(data={"train": folder}), tmp_path / "a").notes
+    assert [note for note in said if "data.validation" in note]
+    assert not TrainingRun(config_of(data={"train": folder, "validation": folder}), tmp_path / "b").notes
+    assert not TrainingRun(config_of(), tmp_path / "c").notes
+
+
 def test_measures_by_hand() -> None:
     logits = torch.tensor([[1.0, 1, -1, -1], [-1, -1, -1, -1], [1, 1, 1, 1]])
     labels = torch.tensor([[True, False, True, False], [True, False, False, False], [False] * 4])

@@ -69,6 +69,8 @@ class TrainingRun:
         self.notes: list[str] = []
         self._open_folder(fresh)
         self.pairs = open_training(config)
+        if config.data.validation == "synthetic" != config.data.train:
+            self.notes.append("the best weights are chosen on generated pairs: give data.validation as well")
         torch.manual_seed(config.seed)
         self.model = GeoMoE(config.network)
         if config.init_from is not None and not self.last_path.exists():

@@ -318,7 +318,8 @@ def test_lists_and_float32_are_taken_and_inputs_stay_as_they_are(estimator) -> N
     np.testing.assert_array_equal(rows, rows_before)
     np.testing.assert_array_equal(weights, weights_before)
     listed = estimator(rows.tolist(), weights.tolist(), inlier_threshold=THRESHOLD)[0]
-    np.testing.assert_array_equal(listed.T_target_source, expected.T_target_source)
+    # Open3D's RANSAC adds up in the order in which its threads finish.
+    np.testing.assert_allclose(listed.T_target_source, expected.T_target_source, rtol=0, atol=1e-12)
     found = estimator(rows.astype(np.float32), inlier_threshold=THRESHOLD)[0]
     assert found.T_target_source.dtype == np.float64
     assert_motion(found.T_target_source, T, degrees=0.1, length=0.01)

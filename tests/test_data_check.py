@@ -152,6 +152,12 @@ def test_predator_pickles(tmp_path: Path) -> None:
     )
     (pair,) = open_collection(tmp_path).pairs
     assert np.allclose(pair.T_target_source, motion(4))
+    lost = tmp_path / "lost"
+    predator(lost)
+    info = load_pickle(lost / "train_info.pkl")
+    with (lost / "train_info.pkl").open("wb") as stream:
+        pickle.dump({**info, "trans": np.full((1, 3, 1), np.nan)}, stream)
+    assert "not finite" in check_folder(lost).broken[0]
     assert np.array_equal(load_fragment(pair.source).file_points, cloud(0))
 
 

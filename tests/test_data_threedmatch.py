@@ -63,6 +63,9 @@ def test_empty_file_has_no_entries(tmp_path: Path) -> None:
         ("0 1 60\n1 0 0 0\n0 1 0 0\n", "line 1"),
         ("0 1 60\n1 0 0 0\n0 1 0 0\n0 0 1 x\n0 0 0 1\n", "line 1"),
         ("0 1 60\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n", "line 1"),
+        ("0 1 60\n1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1: the entry 0 1 is not finite"),
+        ("0 1 60\n2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1: the entry 0 1 is no rigid motion"),
+        ("0 1 60\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "line 1: the entry 0 1 is no rigid motion"),
         ("zero 1 60\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1"),
     ],
 )
@@ -75,6 +78,9 @@ def test_broken_gt_log_names_the_line(tmp_path: Path, text: str, line: str) -> N
 def test_broken_overlap_and_missing_file(tmp_path: Path) -> None:
     (tmp_path / "o.log").write_text("0,1,0.5\n0,2\n")
     with pytest.raises(FormatError, match="line 2"):
+        read_gt_overlap(tmp_path / "o.log")
+    (tmp_path / "o.log").write_text("0,1,nan\n")
+    with pytest.raises(FormatError, match="line 1"):
         read_gt_overlap(tmp_path / "o.log")
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     with pytest.raises(FormatError, match="no text"):

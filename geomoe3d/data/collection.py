@@ -266,6 +266,8 @@ def _open_archive(collection: Collection) -> None:
                 continue
             try:
                 source, target, overlap = folder / words[0], folder / words[1], float(words[2])
+                if not np.isfinite(overlap):
+                    raise ValueError(words[2])
             except (IndexError, ValueError):
                 collection.problems.append(f"'{file}' line {number}: no 'cloud cloud overlap': '{line}'")
                 continue
@@ -302,6 +304,8 @@ def _open_predator(collection: Collection) -> None:
                 raise FormatError(
                     f"lists of unequal length: {len(names)}, {len(R)}, {len(t)}, {len(overlaps)}"
                 )
+            if not all(np.isfinite(values).all() for values in (R, t, overlaps)):
+                raise FormatError("a motion or an overlap is not finite")
         except (GeoMoE3DError, KeyError, TypeError, ValueError) as error:
             collection.problems.append(f"'{file}' is no list of pairs: {error}")
             continue

@@ -8,6 +8,7 @@ that the true motion is the inverse of the entry. Cost: 843 pairs in 0.1 s, thei
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from geomoe3d.types import FloatArray
 
 BENCHMARKS = ("3DMatch", "3DLoMatch")
 DATA_VARIABLE = "GEOMOE3D_DATA"
+
+_MAX_SKEW = 0.02  # published rotations are up to 5e-4 off
 
 PairTable = list[tuple[int, int, FloatArray]]
 
@@ -114,7 +117,7 @@ def read_gt_log(path: str | Path) -> PairTable:
 
     Raises:
         InputError: the file cannot be read.
-        FormatError: an entry is cut short or holds no numbers; names the line.
+        FormatError: an entry is cut short, holds no finite numbers or is no rigid motion; names the line.
     """
     return _read_blocks(Path(path), 4)
 
@@ -143,6 +146,8 @@ def read_gt_overlap(path: str | Path) -> dict[tuple[int, int], float]:
         try:
             i, j, value = line.replace(",", " ").split()
             overlaps[int(i), int(j)] = float(value)
+            if not math.isfinite(overlaps[int(i), int(j)]):
+                raise ValueError(value)
         except ValueError:
             raise FormatError(
                 f"'{path}' line {number}: expected 'i,j,overlap', found '{line.strip()}'"
@@ -318,8 +323,18 @@ def _read_blocks(path: Path, size: int) -> PairTable:
                 f"'{path}' line {number}: the entry holds a {matrix.shape} block, expected ({size}, {size}); "
                 "is the file cut short?"
             )
+        if not np.isfinite(matrix).all():
+            raise FormatError(f"'{path}' line {number}: the entry {i} {j} is not finite")
+        if size == 4 and not _is_motion(matrix):
+            raise FormatError(f"'{path}' line {number}: the entry {i} {j} is no rigid motion")
         entries.append((i, j, matrix))
     return entries
+
+
+def _is_motion(matrix: FloatArray) -> bool:
+    R = matrix[:3, :3]
+    turns = np.abs(R @ R.T - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
+    return bool(turns and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6))
 
 
 def _put(path: Path, text: str) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from geomoe3d.data.describe import describe_collection
 from geomoe3d.data.statistics import Statistics, by_band, distance, measure
 from geomoe3d.data.threedmatch import find_benchmark_root
+from geomoe3d.errors import GeoMoE3DError
 
 _QUANTITIES = {
     "num_points": "points per fragment at 5 cm",
@@ -41,10 +42,13 @@ def main(generated: str, real: str | None, work: str, out: str | None, max_pairs
     """Compare GENERATED fragments with real ones."""
     folder = Path(work)
     folder.mkdir(parents=True, exist_ok=True)
-    root = Path(real) if real else find_benchmark_root()
-    describe_collection(root, folder / "real")
     mine = folder / Path(generated).resolve().name
-    describe_collection(generated, mine)
+    try:
+        root = Path(real) if real else find_benchmark_root()
+        describe_collection(root, folder / "real")
+        describe_collection(generated, mine)
+    except GeoMoE3DError as error:
+        raise click.ClickException(str(error)) from None
     sides = {
         "real": measure(folder / "real", max_pairs=max_pairs),
         "generated": measure(mine, max_pairs=max_pairs),

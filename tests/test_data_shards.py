@@ -112,6 +112,9 @@ def test_corrupted_shard_is_refused(shards: Path, tmp_path: Path) -> None:
     open_shard(shard)  # the header is sound; only the hash tells
     with pytest.raises(FormatError, match=r"features\.npy is damaged"):
         FragmentPairs(shard.parent, verify=True)
+    posed = shards.parent / "posed"
+    with pytest.raises(FormatError, match=r"features\.npy is damaged"):
+        describe_collection(posed, shard.parent)  # started again, it keeps no damaged shard
     for name, change in (("points.npy", lambda d: d[: len(d) // 2]), ("start.npy", lambda d: b"")):
         shard = copy(shards, tmp_path / f"cut-{name}")
         (shard / name).write_bytes(change((shard / name).read_bytes()))

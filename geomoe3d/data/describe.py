@@ -23,7 +23,7 @@ from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
 from geomoe3d.data.fusion import measure_overlap
-from geomoe3d.data.shards import DescribedScene, is_shard, why_stale, write_shard
+from geomoe3d.data.shards import DescribedScene, is_shard, open_shard, why_stale, write_shard
 from geomoe3d.data.splits import split_of
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
 from geomoe3d.types import Float32Array, PointCloud
@@ -125,6 +125,7 @@ def describe_collection(
         reason = why_stale(target, settings, source)
         if reason is not None:
             raise FormatError(f"shard '{target}' is stale: {reason}; remove it, or give another folder")
+        open_shard(target, verify=True)
         report.kept += 1
     done = report.kept
     for made in _run(jobs, workers):

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, shift_frames, transform_points
+from geomoe3d.geometry.se3 import inverse, residuals, rotation_angle_deg, shift_frames, transform_points
 from geomoe3d.judge import Information, Judgement
 from geomoe3d.result import Alternative, CloudReport, RegistrationResult
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
@@ -50,9 +50,7 @@ class Findings:
         """|R p + t - q| of every correspondence (N,); infinite without a transform."""
         if self.evidence is None:
             return np.full(len(matched), np.inf)
-        moved = transform_points(self.T_target_source, matched.source)
-        distances: FloatArray = np.linalg.norm(moved - matched.target, axis=1)
-        return distances
+        return residuals(self.T_target_source, matched.source, matched.target)
 
 
 def finished_result(

@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.answer import Findings
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
+from geomoe3d.geometry.se3 import check_motion, residuals, shift_frames
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import Refiner
 from geomoe3d.stages import StageClock
@@ -129,8 +128,8 @@ class Chooser:
         """Share of the correspondences that agree with a motion."""
         if len(self._matched) == 0:
             return 0.0
-        gaps = transform_points(T_target_source, self._matched.source) - self._matched.target
-        return float((np.linalg.norm(gaps, axis=1) < self._threshold).mean())
+        gaps = residuals(T_target_source, self._matched.source, self._matched.target)
+        return float((gaps < self._threshold).mean())
 
     @property
     def _shift(self) -> float:

@@ -23,7 +23,7 @@ _OFFSET = 7.14
 _SLOPES = np.array([2.68, 2.26, 1.81, -2.86])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
 _MOST_LEAD = 30.0
-_UNRIVALLED_LEAD = 3.0
+UNRIVALLED_LEAD = 3.0
 _LEAST_OBSERVABILITY = 0.005
 _LOW_OVERLAP = 0.1
 
@@ -121,7 +121,7 @@ def judge(
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     if (
         lead < 1 / config.ambiguity_ratio
-        and confidence_score(evidence, _UNRIVALLED_LEAD, support) >= config.min_confidence
+        and confidence_score(evidence, UNRIVALLED_LEAD, support) >= config.min_confidence
     ):
         notes.append(
             f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "
@@ -146,7 +146,7 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
     if evidence.score <= 0:
         return 1.0
     if other is None:
-        return _UNRIVALLED_LEAD
+        return UNRIVALLED_LEAD
     return evidence.score / other.score if other.score > 0 else float("inf")
 
 

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
+from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
-from geomoe3d.judge import CONFIDENCE_INPUTS, confidence_inputs
+from geomoe3d.judge import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, confidence_inputs
 from geomoe3d.registration import Registrar
-from geomoe3d.types import FloatArray
+from geomoe3d.result import RegistrationResult
 from geomoe3d.verification import Evidence
 
 BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
@@ -78,7 +79,7 @@ def measure(pairs: list[tuple[str, str, str, list[Any] | None]], out: Path) -> l
                 "related": T is not None,
                 "right": right,
                 "status": result.status,
-                "lead": 1 / result.alternative.relative_score if result.alternative else 3.0,
+                "lead": lead_of(result),
                 "support": result.num_inliers / max(result.num_correspondences, 1),
                 "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
             }
@@ -90,11 +91,12 @@ def measure(pairs: list[tuple[str, str, str, list[Any] | None]], out: Path) -> l
     return [known[(source, target)] for _, source, target, _ in pairs]
 
 
-def expected_calibration_error(p: FloatArray, right: FloatArray, bins: int = 10) -> float:
-    """Mean distance of confidence and success over equally wide bins, weighted by count."""
-    which = np.minimum((p * bins).astype(int), bins - 1)
-    gaps = [(which == b).sum() * abs(p[which == b].mean() - right[which == b].mean()) for b in set(which)]
-    return float(sum(gaps) / len(p))
+def lead_of(result: RegistrationResult) -> float:
+    """The answer's lead, as the judge saw it."""
+    if result.alternative is None:
+        return UNRIVALLED_LEAD
+    score = result.alternative.relative_score
+    return 1 / score if score > 0 else float("inf")
 
 
 def main() -> None:
@@ -128,7 +130,8 @@ def main() -> None:
     print(
         f"log loss {log_loss(y[related], p[related]):.4f}, AUROC {roc_auc_score(y[related], p[related]):.4f}"
     )
-    print(f"calibration error {expected_calibration_error(p[related], y[related]):.4f}")
+    error = calibration_error_of(p[related], y[related])(np.ones((1, related.sum())))[0]
+    print(f"calibration error {error:.4f}")
     for least in (0.8, 0.85, 0.9, 0.95, 0.97):
         above = related & (p > least)
         print(

@@ -9,10 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,7 @@ from geomoe3d.data.shards import DescribedScene, is_shard, open_shard, why_stale
 from geomoe3d.data.splits import split_of
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
 from geomoe3d.types import Float32Array, PointCloud
+from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 VOXEL_SIZE = 0.05
 
@@ -115,6 +113,8 @@ def describe_collection(
         "preparation": PreparationConfig().model_dump(mode="json"),
         "groups": list(groups) if groups is not None else None,
     }
+    if workers < 1:
+        raise InputError(f"at least one worker is needed, found {workers}")
     jobs = []
     for scene, pairs in by_scene.items():
         target = folder / scene.replace("/", "_")
@@ -128,14 +128,16 @@ def describe_collection(
         open_shard(target, verify=True)
         report.kept += 1
     done = report.kept
-    for made in _run(jobs, workers):
-        report.skipped += made.skipped
+    skipped: dict[str, list[str]] = {}
+    for job, made in _run(jobs, workers):
+        skipped[job.scene] = made.skipped
         report.made += made.made
         report.num_fragments += made.num_fragments
         report.num_pairs += made.num_pairs
         done += 1
         if progress is not None:
             progress(done, len(by_scene))
+    report.skipped += [line for job in jobs for line in skipped[job.scene]]  # in the order of the scenes
     return report
 
 
@@ -160,20 +162,13 @@ class _Made:
     skipped: list[str]
 
 
-def _run(jobs: list[_Job], workers: int) -> Iterator[_Made]:
-    """Results in the order of the jobs."""
-    if workers < 1:
-        raise InputError(f"at least one worker is needed, found {workers}")
-    if workers == 1 or len(jobs) < 2:
-        yield from map(_make_shard, jobs)
-        return
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
-        try:
-            yield from pool.map(_make_shard, jobs)
-        except BrokenProcessPool:
-            raise InputError(
-                "a worker died, perhaps for lack of memory; the same command goes on, with fewer --workers"
-            ) from None
+def _run(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, _Made]]:
+    """Every job with what came of it, as they finish."""
+    pool = SerialPool() if workers == 1 or len(jobs) < 2 else ProcessPool(min(workers, len(jobs)))
+    for job, made in run_surviving(pool, _make_shard, jobs):
+        if isinstance(made, WorkerDied):
+            made = _Made(0, 0, 0, [f"scene '{job.scene}': {made.reason}"])
+        yield job, made
 
 
 def _make_shard(job: _Job) -> _Made:

@@ -34,6 +34,18 @@ def inverse(T: FloatArray) -> FloatArray:
     return make_transform(R.T, -R.T @ T[:3, 3])
 
 
+def residuals(T: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
+    """|R p + t - q| of paired points (N, 3) and (N, 3), (N,)."""
+    distances: FloatArray = np.linalg.norm(transform_points(T, source) - target, axis=1)
+    return distances
+
+
+def cross_matrix(v: FloatArray) -> FloatArray:
+    """(3, 3) so that cross_matrix(v) @ x is the cross product of v and x."""
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def rotation_angle_deg(R: FloatArray) -> float:
     """Angle of a rotation (3, 3) in degrees, in [0, 180]; accurate near 0 as well as near 180."""
     cosine = (np.trace(R) - 1.0) / 2.0

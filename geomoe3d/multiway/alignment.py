@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3, transform_points
+from geomoe3d.geometry.se3 import cross_matrix, inverse, make_transform, project_to_so3, transform_points
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
@@ -192,16 +192,14 @@ def _lever(center: FloatArray, radius: float) -> FloatArray:
     About a far origin a turn would look like a large shift, and damping would hold back the wrong one. Turns
     are counted by how far they move a point ``radius`` away.
     """
-    x, y, z = center
     M = np.eye(6)  # p + w x (p - c) + v moves the origin by v + c x w
     M[:3, :3] /= radius
-    M[3:, :3] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / radius
+    M[3:, :3] = cross_matrix(center) / radius
     return M
 
 
 def _moved(T: FloatArray, turn: FloatArray, shift: FloatArray, center: FloatArray) -> FloatArray:
     """A pose after a small turn (rotation vector) about a centre, and a shift, in the group's frame."""
-    x, y, z = turn
     # To first order; the projection makes it a rotation, and the next step corrects what is left.
-    R = project_to_so3(np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    R = project_to_so3(np.eye(3) + cross_matrix(turn))
     return make_transform(project_to_so3(R @ T[:3, :3]), R @ (T[:3, 3] - center) + center + shift)

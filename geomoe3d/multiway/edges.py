@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from geomoe3d.batch.store import Outcome
-from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, shift_frames, transform_points
+from geomoe3d.geometry.se3 import cross_matrix, inverse, rotation_angle_deg, shift_frames, transform_points
 from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
 
@@ -138,9 +138,8 @@ def _about_origin(information: FloatArray, center: FloatArray) -> FloatArray:
 
     p + w x (p - c) + v = p + w x p + (v - w x c), so the perturbation about c is v = v_0 - c x w.
     """
-    x, y, z = center
     A = np.eye(6)
-    A[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    A[3:, :3] = -cross_matrix(center)
     moved: FloatArray = A.T @ information @ A
     return moved
 

@@ -27,6 +27,7 @@ from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
+from geomoe3d.estimators.proposals import propose
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
@@ -75,7 +76,9 @@ class Registrar:
     ) -> None:
         self.config = config or RegistrationConfig()
         self._cache = cache
-        self._filter: Filter = make_filter(self.config.filter.name, self.config.filter.weights)
+        self._filter: Filter = make_filter(
+            self.config.filter.name, self.config.filter.weights, self.config.estimator
+        )
         self._estimator: Estimator = make_estimator(self.config.estimator)
 
     @classmethod
@@ -203,7 +206,7 @@ class Registrar:
         weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
         clock("solve")
         threshold = config.estimator.inlier_threshold * voxel_size
-        return matched, weighed, self.solve(matched, weighed.weights, threshold)
+        return matched, weighed, self.solve(matched, weighed, threshold)
 
     def propose_on_grid(
         self, voxel_size: float, described: tuple[PreparedCloud, PreparedCloud], clock: StageClock
@@ -221,21 +224,19 @@ class Registrar:
             return []
         return self.propose((source, target), clock)[2]
 
-    def solve(self, matched: Correspondences, weights: FloatArray, threshold: float) -> list[Hypothesis]:
-        """Hypotheses from all weighted correspondences, and from the mutual ones alone.
-
-        The second round costs little and often holds the right motion where one-way matches drown it.
-        """
-        config, seed = self.config.estimator, self.config.seed
-        if matched.mutual is not None:
-            weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
-        found = self._estimator(matched.points, weights, inlier_threshold=threshold, seed=seed)
-        if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
-            rows = matched.mutual
-            found += self._estimator(
-                matched.points[rows], weights[rows], inlier_threshold=threshold, seed=seed
-            )
-        return found
+    def solve(self, matched: Correspondences, weighed: FilterOutput, threshold: float) -> list[Hypothesis]:
+        """Hypotheses: those that the filter has judged already, or what the estimator proposes."""
+        config = self.config.estimator
+        if weighed.hypotheses and config.name == "consensus":
+            return list(weighed.hypotheses)
+        return propose(
+            self._estimator,
+            matched,
+            weighed.weights,
+            config,
+            inlier_threshold=threshold,
+            seed=self.config.seed,
+        )
 
 
 def register(

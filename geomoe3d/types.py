@@ -92,6 +92,8 @@ class Correspondences:
         feature_distance: (N,) float32 Euclidean distance of the unit features in [0, 2], or None.
         ratio: (N,) float32 feature distance over that of the second best target, in [0, 1], or None.
         mutual: (N,) True where the source point is also the target's nearest in feature space, or None.
+        viewpoints: (3,) places of the source's and the target's sensor, each in its own cloud's local
+            coordinates, or None for both where they are not known.
     """
 
     points: FloatArray
@@ -100,6 +102,7 @@ class Correspondences:
     feature_distance: Float32Array | None = None
     ratio: Float32Array | None = None
     mutual: BoolArray | None = None
+    viewpoints: tuple[FloatArray, FloatArray] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -127,6 +130,7 @@ class Correspondences:
             pick(self.feature_distance),  # type: ignore[arg-type]
             pick(self.ratio),  # type: ignore[arg-type]
             pick(self.mutual),  # type: ignore[arg-type]
+            self.viewpoints,
         )
 
 
@@ -138,8 +142,10 @@ class Hypothesis:
         T_target_source: (4, 4), p_target = R p_source + t in local coordinates.
         score: larger is better; comparable only between hypotheses of one estimator call.
         num_inliers: correspondences with a residual under the inlier threshold.
+        verdict: logit that the motion is right, where a network has judged it, else None.
     """
 
     T_target_source: FloatArray
     score: float
     num_inliers: int
+    verdict: float | None = None

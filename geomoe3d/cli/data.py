@@ -262,3 +262,30 @@ def features(
         f"{report.kept} kept, in {out}"
     )
     context.exit(0 if report.made or report.kept else BAD_INPUT)
+
+
+@command.command(context_settings=HELP)
+@click.argument("features", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--pairs", required=True, type=click.IntRange(min=1), help="Pairs to draw, in hundreds.")
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Another seed, other pairs."
+)
+@click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
+@traceback_option
+@click.pass_context
+def motions(context: click.Context, features: str, out: str, pairs: int, seed: int, workers: int) -> None:
+    """Draw pairs from the shards FEATURES and keep them with the motions that consensus proposes, in OUT.
+
+    FEATURES is what 'geomoe3d data features' made. A network that judges motions trains on OUT
+    (configs/train/motions.yaml, data.train=OUT). Started again, it goes on. Exit code 2 when a shard fails.
+    """
+    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.training.motions import propose_motions
+
+    with stdout_to_stderr(), progress_bar("shards", quiet=False) as advance:
+        report = propose_motions(features, out, pairs, seed=seed, workers=workers, progress=advance)
+    for line in report.failed:
+        click.echo(f"failed: {line}", err=True)
+    click.echo(f"{report.made} shards made, {report.kept} kept, in {out}")
+    context.exit(BAD_INPUT if report.failed else 0)

@@ -13,7 +13,14 @@ import numpy as np
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
 from geomoe3d.threads import single_blas_thread
-from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
+from geomoe3d.types import (
+    BoolArray,
+    Correspondences,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    PreparedCloud,
+)
 
 _BLOCK_ENTRIES = 12_000_000
 _SMALL_ENTRIES = 100_000_000  # up to 10,000 against 10,000 points one thread is about as fast as two
@@ -52,12 +59,19 @@ def match(
         distance.ravel(),
         ratio.ravel(),
         mutual,
+        _viewpoints(source, target),
     ).take(keep)
     if len(found) <= config.max_correspondences:
         return found
     shuffled = np.random.default_rng(seed).permutation(len(found))
     mutual_first = np.argsort(~mutual[keep][shuffled], kind="stable")
     return found.take(np.sort(shuffled[mutual_first[: config.max_correspondences]]))
+
+
+def _viewpoints(source: PreparedCloud, target: PreparedCloud) -> tuple[FloatArray, FloatArray] | None:
+    if source.viewpoint is None or target.viewpoint is None:
+        return None
+    return source.viewpoint, target.viewpoint
 
 
 def nearest_features(

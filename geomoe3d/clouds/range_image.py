@@ -55,10 +55,17 @@ class RangeImage:
         Returns:
             (number in seen directions, number of these that lie in space which the sensor saw through).
         """
+        seen, margins = self.margins(points)
+        return int(seen.sum()), int((margins < -margin).sum())
+
+    def margins(self, points: FloatArray) -> tuple[BoolArray, FloatArray]:
+        """For points (N, 3) that are claimed to exist: whether the sensor saw something in their direction,
+        and how far they lie behind it (negative: in space which it saw through; infinite where not seen)."""
         row, column, distance = _pixels(points, self.viewpoint, self.axes, self.seen.shape)
         seen = self.seen[row, column]
-        through = seen & (distance < self.nearest[row, column] - margin)
-        return int(seen.sum()), int(through.sum())
+        behind = np.full(len(points), np.inf)
+        behind[seen] = distance[seen] - self.nearest[row[seen], column[seen]]
+        return seen, behind
 
 
 def _viewing_axes(rays: FloatArray) -> FloatArray:

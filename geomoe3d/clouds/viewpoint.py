@@ -35,6 +35,20 @@ def find_viewpoints(
     return -source.origin, -target.origin
 
 
+def believed_viewpoints(
+    correspondences: FloatArray, origins: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Rule ``auto`` for bare correspondences (N, 6) in local coordinates: the origins, or None.
+
+    Args:
+        correspondences: N >= 1 rows [source, target].
+        origins: (3,) shifts that were removed from the two halves.
+    """
+    halves = correspondences[:, :3], correspondences[:, 3:]
+    clouds = [PointCloud(half, origin) for half, origin in zip(halves, origins, strict=True)]
+    return (-origins[0], -origins[1]) if all(_origin_is_near(cloud) for cloud in clouds) else None
+
+
 def _origin_is_near(cloud: PointCloud) -> bool:
     low, high = cloud.points.min(0), cloud.points.max(0)
     outside = np.maximum(np.maximum(low + cloud.origin, -(high + cloud.origin)), 0)

@@ -46,8 +46,8 @@ class ConsensusEstimator:
     """
 
     num_hypotheses: int = 8
-    num_seeds: int = 300
-    set_size: int = 10
+    num_seeds: int = 1000
+    set_size: int = 4
     num_refined: int = 20
     num_refits: int = 6
     distinct_angle_deg: float = 15.0

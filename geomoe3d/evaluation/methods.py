@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.clouds.viewpoint import believed_viewpoints
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.estimators.base import make_estimator
@@ -118,7 +119,9 @@ class OurMethod:
         self._registrar: Registrar | None = None
         self._filter: Filter | None = None
         if self.absent() is None:
-            self._filter = make_filter(self.config.filter.name, self.config.filter.weights)
+            self._filter = make_filter(
+                self.config.filter.name, self.config.filter.weights, self.config.estimator
+            )
             network = getattr(self._filter, "config", None)
             if _MATCHING_CHANNELS & set(getattr(network, "extra_channels", ())):
                 self.inputs -= {"correspondences"}  # bare coordinates lack what the network was trained with
@@ -168,9 +171,12 @@ class OurMethod:
             threshold = self.config.estimator.inlier_threshold * given.voxel_size
         clock = StageClock()
         clock("weigh")
-        weighed = self._filter(Correspondences(local), voxel_size=given.voxel_size, seed=given.seed)
+        matched = Correspondences(local, viewpoints=believed_viewpoints(local, origins))
+        weighed = self._filter(matched, voxel_size=given.voxel_size, seed=given.seed)
         clock("solve")
-        found = self._estimator(local, weighed.weights, inlier_threshold=threshold, seed=given.seed)
+        found = list(weighed.hypotheses)
+        if not found or self.config.estimator.name != "consensus":
+            found = self._estimator(local, weighed.weights, inlier_threshold=threshold, seed=given.seed)
         stages = _stages(clock.stop())
         motions = [shift_frames(hypothesis.T_target_source, *origins) for hypothesis in found]
         return Answer(

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from geomoe3d.config import Section
 
-ExtraChannel = Literal["compatibility", "hypothesis", "feature_distance", "ratio", "mutual"]
+ExtraChannel = Literal["compatibility", "hypothesis", "feature_distance", "ratio", "mutual", "aligned"]
 
 CHANNEL_WIDTHS: dict[str, int] = {
     "compatibility": 4,
@@ -21,6 +21,7 @@ CHANNEL_WIDTHS: dict[str, int] = {
     "feature_distance": 1,
     "ratio": 1,
     "mutual": 1,
+    "aligned": 22,
 }
 
 
@@ -84,6 +85,10 @@ class NetworkConfig(Section):
             raise ValueError("motion_form none needs extra_channels, else the network sees nothing")
         if len(set(self.extra_channels)) != len(self.extra_channels):
             raise ValueError(f"extra_channels {list(self.extra_channels)} repeats a name")
+        if self.judges_motions and (self.extra_channels != ("aligned",) or self.motion_form != "none"):
+            raise ValueError("the channels 'aligned' stand alone: no other extra channel, motion_form none")
+        if self.judges_motions and (self.knn_space != "source" or self.correspondence_dim != 6):
+            raise ValueError("the channels 'aligned' need knn_space source and correspondence_dim 6")
         if self.correspondence_dim == 4 and self.needs_compatibility:
             raise ValueError("length compatibility holds between 3D points; correspondence_dim is 4")
         return self
@@ -93,6 +98,11 @@ class NetworkConfig(Section):
         """Whether any input is computed from length compatibility."""
         used = {"compatibility", "hypothesis"} & set(self.extra_channels)
         return bool(used) or self.knn_space == "compatibility"
+
+    @property
+    def judges_motions(self) -> bool:
+        """Whether the network sees a pair under a given motion, and says whether that motion is right."""
+        return "aligned" in self.extra_channels
 
     @property
     def num_extra_channels(self) -> int:

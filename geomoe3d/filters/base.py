@@ -1,6 +1,6 @@
 """The one form of a filter, and the choice by name.
 
-A filter gives every putative correspondence a weight; it drops nothing and knows no transform. Place:
+A filter gives every putative correspondence a weight and drops nothing. Place:
 weigh, between match and solve. New filters join by a line in `_FACTORIES`; the pipeline does not change.
 """
 
@@ -13,8 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
+from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import ConfigError, DependencyError
-from geomoe3d.types import Correspondences, FloatArray, IntArray
+from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,15 @@ class FilterOutput:
         logits: (N,) raw scores, larger is likelier an inlier, or None.
         groups: (N,) small integers, which part of the filter handled each correspondence, or None.
         group_names: a name for each group, for display.
+        hypotheses: motions that the filter weighed the correspondences under, best first; the estimator
+            need not seek them again. Empty for filters that know none.
     """
 
     weights: FloatArray
     logits: FloatArray | None = None
     groups: IntArray | None = None
     group_names: tuple[str, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
 
 
 class Filter(Protocol):
@@ -59,17 +63,17 @@ class NoFilter:
         return FilterOutput(np.ones(len(correspondences)))
 
 
-def _none(weights: str | None) -> Filter:
+def _none(weights: str | None, estimator: EstimatorConfig) -> Filter:
     return NoFilter()
 
 
-def _spectral(weights: str | None) -> Filter:
+def _spectral(weights: str | None, estimator: EstimatorConfig) -> Filter:
     from geomoe3d.filters.spectral import SpectralFilter
 
     return SpectralFilter()
 
 
-def _geomoe(weights: str | None) -> Filter:
+def _geomoe(weights: str | None, estimator: EstimatorConfig) -> Filter:
     try:
         from geomoe3d.filters.geomoe_filter import geomoe_filter
     except ImportError as error:
@@ -77,10 +81,10 @@ def _geomoe(weights: str | None) -> Filter:
             f"the filter 'geomoe' needs PyTorch and safetensors ({error}); `geomoe3d doctor` gives the "
             "command that installs them, or use --filter none"
         ) from error
-    return geomoe_filter(weights)
+    return geomoe_filter(weights, estimator)
 
 
-_FACTORIES: dict[str, Callable[[str | None], Filter]] = {
+_FACTORIES: dict[str, Callable[[str | None, EstimatorConfig], Filter]] = {
     "none": _none,
     "spectral": _spectral,
     "geomoe": _geomoe,
@@ -92,12 +96,13 @@ def filter_names() -> list[str]:
     return list(_FACTORIES)
 
 
-def make_filter(name: str, weights: str | None = None) -> Filter:
+def make_filter(name: str, weights: str | None = None, estimator: EstimatorConfig | None = None) -> Filter:
     """The filter of a given name.
 
     Args:
         name: one of `filter_names`.
         weights: file or name of trained weights, for filters that have any; None takes the shipped ones.
+        estimator: what proposes motions to filters that judge some; None takes the defaults.
 
     Raises:
         ConfigError: no filter has this name; the message gives the nearest one.
@@ -105,7 +110,7 @@ def make_filter(name: str, weights: str | None = None) -> Filter:
         DependencyError: a library that the filter needs is not installed.
     """
     if name in _FACTORIES:
-        return _FACTORIES[name](weights)
+        return _FACTORIES[name](weights, estimator or EstimatorConfig())
     close = difflib.get_close_matches(name, _FACTORIES, n=1, cutoff=0.4)
     hint = f"did you mean '{close[0]}'?" if close else "known: " + ", ".join(_FACTORIES)
     raise ConfigError(f"unknown filter '{name}'; {hint}")

@@ -8,6 +8,7 @@ that a softmax cancels are dropped. Logits agree with `GeoMoE` to 1e-4; tests ho
 
 from __future__ import annotations
 
+import copy
 from typing import NamedTuple
 
 import torch
@@ -24,7 +25,7 @@ from geomoe3d.filters.folded_blocks import (
     scale_shift,
     two_layer,
 )
-from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.geomoe import PRIOR_KERNEL, GeoMoE, together_under_motion
 from geomoe3d.filters.layers import (
     GeoMoELayer,
     LocalOrthogonalContext,
@@ -42,11 +43,13 @@ class FoldedOutput(NamedTuple):
         logits: (L, N) float32.
         sub_field: (N,) int64 sub-field from which each correspondence is mostly rebuilt, or None.
         expert: (M,) int64 main expert of each sub-field, or None (also without experts).
+        verdict: scalar logit that the motion is right, or None for a network that is given none.
     """
 
     logits: Tensor
     sub_field: Tensor | None
     expert: Tensor | None
+    verdict: Tensor | None = None
 
 
 class FoldedGeoMoE:
@@ -61,6 +64,7 @@ class FoldedGeoMoE:
         with torch.no_grad():
             self._initialise = _Initialise(model.initialise)
             self._layers = [_Layer(layer) for layer in model.layers if isinstance(layer, GeoMoELayer)]
+            self._verdict = None if model.verdict is None else copy.deepcopy(model.verdict)
 
     @torch.inference_mode()
     def __call__(
@@ -76,16 +80,19 @@ class FoldedGeoMoE:
         """
         index = neighbors.t().reshape(-1)
         field = self._initialise(coordinates, channels)
-        logits: Tensor | None = None
+        together = None if self._verdict is None else together_under_motion(channels)
+        logits: Tensor | None = None if together is None else together - PRIOR_KERNEL
         verdicts = []
         attention = expert = None
         for layer in self._layers:
             field, logits, attention, expert = layer(field, logits, index)
             verdicts.append(logits)
-        stacked = torch.stack(verdicts)
+        stacked, verdict = torch.stack(verdicts), None
+        if self._verdict is not None and channels is not None and together is not None:
+            verdict = self._verdict(channels[None], field[None], together[None], None)[0]
         if not insight or attention is None:
-            return FoldedOutput(stacked, None, None)
-        return FoldedOutput(stacked, attention.mean(dim=0).argmax(dim=0), expert)
+            return FoldedOutput(stacked, None, None, verdict)
+        return FoldedOutput(stacked, attention.mean(dim=0).argmax(dim=0), expert, verdict)
 
 
 class _Initialise:

@@ -12,15 +12,17 @@ the paper, and where its text and released code differ `NetworkConfig` has a swi
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from geomoe3d.filters.aligned import CHANNELS
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.layers import GeoMoELayer, MotionInitialisation, motion
+from geomoe3d.filters.layers import GeoMoELayer, MotionInitialisation, MotionVerdict, motion
 from geomoe3d.filters.moe import Routing
 from geomoe3d.filters.neighbors import nearest_neighbors
 from geomoe3d.filters.norms import frozen_statistics
@@ -54,6 +56,7 @@ class GeoMoEOutput:
         entropy: (L, 2) router entropy, or None.
         kept_fraction: (L,) share of correspondences with a positive logit.
         insights: one per layer if asked for, else empty.
+        verdict: (B,) logit that the motion of each field is right, or None for a network that is given none.
     """
 
     logits: Tensor
@@ -62,6 +65,7 @@ class GeoMoEOutput:
     entropy: Tensor | None
     kept_fraction: Tensor
     insights: tuple[LayerInsight, ...] = ()
+    verdict: Tensor | None = None
 
 
 class GeoMoE(nn.Module):
@@ -76,6 +80,7 @@ class GeoMoE(nn.Module):
         self.config = config or NetworkConfig()
         self.initialise = MotionInitialisation(self.config)
         self.layers = nn.ModuleList(GeoMoELayer(self.config) for _ in range(self.config.num_layers))
+        self.verdict = MotionVerdict(self.config) if self.config.judges_motions else None
         self.checkpoint_activations = False
 
     def forward(
@@ -103,7 +108,8 @@ class GeoMoE(nn.Module):
         neighbors = neighbors.transpose(1, 2).contiguous()
         wide_mask = None if mask is None else mask[:, None]
         field = self.initialise(coordinates, channels, wide_mask)
-        logits: Tensor | None = None
+        together = None if self.verdict is None else together_under_motion(channels)
+        logits: Tensor | None = None if together is None else together - PRIOR_KERNEL
         verdicts, routings, insights = [], [], []
         for layer in self.layers:
             if self.checkpoint_activations and self.training:
@@ -123,7 +129,20 @@ class GeoMoE(nn.Module):
             routings.append(routing)
             if insight:
                 insights.append(_insight(attention, routing))
-        return _collect(torch.stack(verdicts), routings, mask, tuple(insights))
+        verdict = None
+        if self.verdict is not None:
+            verdict = self.verdict(channels, field, together, wide_mask)
+        return replace(_collect(torch.stack(verdicts), routings, mask, tuple(insights)), verdict=verdict)
+
+
+PRIOR_KERNEL = math.exp(-0.5 / 0.75**2)
+"""The channel ``residual`` at a residual of one inlier threshold: the first prior is what lies below."""
+
+
+def together_under_motion(channels: Tensor | None) -> Tensor:
+    """The channel ``residual`` of (B, N, C) aligned channels: (B, N), 1 where a motion fits exactly."""
+    assert channels is not None
+    return channels[..., CHANNELS.index("residual")]
 
 
 def find_neighbors(coordinates: Tensor, config: NetworkConfig, mask: Tensor | None = None) -> Tensor:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from geomoe3d.errors import InputError, NonFiniteError
+from geomoe3d.filters.aligned import AlignedChannels
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.compatibility import compatibility_inputs
 from geomoe3d.filters.geomoe import find_neighbors
@@ -92,20 +93,10 @@ def pair_input(
             the network was trained with and that is not given.
         NonFiniteError: a coordinate is NaN or infinite.
     """
-    points = torch.as_tensor(correspondences).double()
-    if points.ndim != 2 or points.shape[1] != config.correspondence_dim:
-        raise InputError(
-            f"correspondences must be (N, {config.correspondence_dim}) for this network, "
-            f"found {tuple(points.shape)}"
-        )
-    if len(points) < MIN_CORRESPONDENCES:
-        raise InputError(f"{len(points)} correspondences; the network needs at least {MIN_CORRESPONDENCES}")
-    if not (np.isfinite(voxel_size) and voxel_size > 0):
-        raise InputError(f"voxel_size must be positive, found {voxel_size}")
-    if not bool(torch.isfinite(points).all()):
-        raise NonFiniteError("correspondences hold NaN or infinite coordinates; drop those rows first")
-    voxels = ((points - points.mean(dim=0)) / voxel_size).float()
+    voxels = _check(correspondences, voxel_size, config)[1]
     coordinates = voxels / config.unit_voxels
+    if config.judges_motions:
+        raise InputError("this network judges motions; prepare it with motion_inputs, which is given some")
     given = {"feature_distance": feature_distance, "ratio": ratio, "mutual": mutual}
     compatibility = compatibility_inputs(voxels, config) if config.needs_compatibility else None
     channels: list[Tensor] = []
@@ -124,6 +115,33 @@ def pair_input(
     return PairInput(coordinates, torch.cat(channels, dim=1) if channels else None, neighbors)
 
 
+def motion_inputs(
+    correspondences: NDArray[Any] | Tensor,
+    motions: NDArray[Any],
+    viewpoints: tuple[NDArray[Any] | None, NDArray[Any] | None],
+    voxel_size: float,
+    config: NetworkConfig,
+) -> list[PairInput]:
+    """Prepare one pair for a network that judges motions: one input per motion.
+
+    Args:
+        correspondences: (N, 6) float, N >= 3, any unit.
+        motions: (K, 4, 4) p_target = R p_source + t, in the same coordinates.
+        viewpoints: (3,) where the two sensors stood, same coordinates, or None for both.
+        voxel_size: in the same unit.
+        config: of a network with the channels ``aligned``.
+
+    Raises:
+        InputError, NonFiniteError: as `pair_input`.
+    """
+    points, voxels = _check(correspondences, voxel_size, config)
+    coordinates = voxels / config.unit_voxels
+    neighbors = find_neighbors(coordinates[None], config)[0]
+    aligned = AlignedChannels(points.numpy(), viewpoints, config.compatibility_threshold * voxel_size)
+    channels = torch.from_numpy(aligned(motions[:, :3, :3], motions[:, :3, 3]))
+    return [PairInput(coordinates, of_one, neighbors) for of_one in channels]
+
+
 def collate(pairs: list[PairInput]) -> BatchInput:
     """Pad pairs to the longest and stack them."""
     lengths = [len(pair.coordinates) for pair in pairs]
@@ -140,6 +158,25 @@ def collate(pairs: list[PairInput]) -> BatchInput:
     if min(lengths) < longest:
         mask = torch.arange(longest)[None] < torch.tensor(lengths)[:, None]
     return BatchInput(coordinates, channels, neighbors, mask)
+
+
+def _check(
+    correspondences: NDArray[Any] | Tensor, voxel_size: float, config: NetworkConfig
+) -> tuple[Tensor, Tensor]:
+    """The points (N, 2d) in double precision, and centred in voxels, float32."""
+    points = torch.as_tensor(correspondences).double()
+    if points.ndim != 2 or points.shape[1] != config.correspondence_dim:
+        raise InputError(
+            f"correspondences must be (N, {config.correspondence_dim}) for this network, "
+            f"found {tuple(points.shape)}"
+        )
+    if len(points) < MIN_CORRESPONDENCES:
+        raise InputError(f"{len(points)} correspondences; the network needs at least {MIN_CORRESPONDENCES}")
+    if not (np.isfinite(voxel_size) and voxel_size > 0):
+        raise InputError(f"voxel_size must be positive, found {voxel_size}")
+    if not bool(torch.isfinite(points).all()):
+        raise NonFiniteError("correspondences hold NaN or infinite coordinates; drop those rows first")
+    return points, ((points - points.mean(dim=0)) / voxel_size).float()
 
 
 def _column(name: str, values: NDArray[Any] | Tensor | None, like: Tensor) -> Tensor:

@@ -226,3 +226,59 @@ class GeoMoELayer(nn.Module):
         z, routing2 = self.rectify(z)
         field, attention = self.reconstruct(field, z, a_mask=mask)
         return field, self.predict(field, mask), attention, (routing1, routing2)
+
+
+class MotionVerdict(nn.Module):
+    """Whether the motion that a field was seen under is right: one logit per field.
+
+    From the channels' means over all correspondences, which the norms inside the network take out of the
+    field; the same over those that the motion brings together; and the field itself, pooled evenly and by
+    attention.
+    """
+
+    _LEAST_MEAN = 0.005  # means are shares of the correspondences; below this they say nothing
+
+    def __init__(self, config: NetworkConfig, hidden_width: int = 64) -> None:
+        super().__init__()
+        self.attend = Pointwise(config.width, 1)
+        self.norm = BatchNorm(3 * config.input_width + 1 + 2 * config.width)
+        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, hidden_width)
+        self.out = Pointwise(hidden_width, 1)
+
+    def forward(self, channels: Tensor, field: Tensor, together: Tensor, mask: Tensor | None) -> Tensor:
+        """Verdicts of a batch.
+
+        Args:
+            channels: (B, N, C) what the network was given.
+            field: (B, D, N) of the last layer.
+            together: (B, N) in [0, 1], how far the motion brings each correspondence together.
+            mask: (B, 1, N) or None.
+
+        Returns:
+            (B,) logits, at least float32.
+        """
+        x = channels.transpose(1, 2).to(torch.promote_types(field.dtype, torch.float32))
+        field = field.to(x.dtype)
+        scores = self.attend(field)
+        real = x.new_ones(()).expand(len(x), 1, x.shape[2]) if mask is None else mask.to(x.dtype)
+        if mask is not None:
+            scores = scores.masked_fill(~mask, -torch.inf)
+        count = real.sum(2)
+        means = (x * real).sum(2) / count
+        gate = together[:, None] * real
+        total = gate.sum(2)
+        kept = (x * gate).sum(2) / (total + 1e-3)
+        pooled = torch.cat(
+            [
+                means,
+                (means.clamp(min=0) + self._LEAST_MEAN).log(),
+                kept,
+                (total + 0.1).log(),
+                (field * real).sum(2) / count,
+                (field * scores.softmax(dim=2)).sum(2),
+            ],
+            dim=1,
+        )
+        hidden = F.relu(self.hidden(self.norm(pooled[:, :, None])))
+        verdict: Tensor = self.out(hidden)[:, 0, 0]
+        return verdict

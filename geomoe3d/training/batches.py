@@ -21,38 +21,61 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.inputs import BatchInput, PairInput, collate, pair_input
+from geomoe3d.filters.inputs import BatchInput, PairInput, collate, motion_inputs, pair_input
+from geomoe3d.geometry.se3 import rotation_error_deg
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
 from geomoe3d.training.fragment_pairs import FragmentPairs
 from geomoe3d.training.losses import network_motion
 from geomoe3d.training.pairs import PairDataset, ShardFolder, TrainingPair
 from geomoe3d.training.synthetic import SyntheticPairs
+from geomoe3d.types import BoolArray, FloatArray
 
 _VALIDATION_SEED = 1_000_003
+MAX_ROTATION_DEG = 15.0
+MAX_TRANSLATION_VOXELS = 6.0
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One pair, ready for the network: input, labels (N,) and true motion (4, 4) in network units."""
+    """One pair, ready for the network.
 
-    input: PairInput
+    Attributes:
+        inputs: what the network sees: one input, or one for each of M motions that it is to judge.
+        labels: (N,) bool.
+        truth: (4, 4) true motion in network units.
+        right: (M,) bool, which motions are right; None for networks that judge none.
+    """
+
+    inputs: tuple[PairInput, ...]
     labels: Tensor
     truth: Tensor
+    right: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples padded to the longest: labels (B, N) bool, False at padding; truth (B, 4, 4) float32."""
+    """Inputs of all samples, padded to the longest.
+
+    Attributes:
+        input: B inputs, those of one sample one after the other.
+        labels: (B, N) bool, False at padding.
+        truth: (B, 4, 4) float32.
+        right: (B,) bool, whether each input's motion is right, or None.
+        pair: (B,) int64, the sample that each input belongs to.
+    """
 
     input: BatchInput
     labels: Tensor
     truth: Tensor
+    right: Tensor | None
+    pair: Tensor
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
-        labels, truth = (x.to(device, non_blocking=True) for x in (self.labels, self.truth))
-        return Batch(self.input.to(device), labels, truth)
+        labels, truth, pair = (x.to(device, non_blocking=True) for x in (self.labels, self.truth, self.pair))
+        right = None if self.right is None else self.right.to(device, non_blocking=True)
+        return Batch(self.input.to(device), labels, truth, right, pair)
 
 
 def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
@@ -78,13 +101,36 @@ def open_validation(config: TrainConfig) -> PairDataset:
     return open_pairs(config.data.validation, config.data, _VALIDATION_SEED)
 
 
-def make_sample(pair: TrainingPair, network: NetworkConfig) -> Sample:
+def make_sample(
+    pair: TrainingPair,
+    network: NetworkConfig,
+    data: DataConfig | None = None,
+    rng: np.random.Generator | None = None,
+) -> Sample:
     """A pair as network input with its truth in network units.
 
+    Args:
+        pair: with motions, where the network judges some.
+        network: that is to see it.
+        data: how many motions are looked at; None takes the defaults.
+        rng: draws motions among those proposed, and hides viewpoints; None takes the first ones, hides none.
+
     Raises:
-        InputError: the pair cannot be used (see `pair_input`).
+        InputError: the pair cannot be used (see `pair_input`), or lacks motions.
     """
+    data = data or DataConfig()
     points = torch.from_numpy(pair.correspondences).double()
+    labels = torch.from_numpy(np.ascontiguousarray(pair.labels))
+    truth = network_motion(
+        points, torch.from_numpy(pair.T_target_source), pair.voxel_size, network.unit_voxels
+    ).float()
+    if network.judges_motions:
+        motions, right = choose_motions(pair, data.motions_per_pair, rng)
+        views: tuple[Any, Any] = (None, None)
+        if pair.viewpoints is not None and not (rng is not None and rng.random() < data.hidden_viewpoints):
+            views = (pair.viewpoints[0], pair.viewpoints[1])
+        several = motion_inputs(points, motions, views, pair.voxel_size, network)
+        return Sample(tuple(several), labels, truth, torch.from_numpy(right))
     inputs = pair_input(
         points,
         pair.voxel_size,
@@ -93,17 +139,54 @@ def make_sample(pair: TrainingPair, network: NetworkConfig) -> Sample:
         ratio=pair.ratio,
         mutual=pair.mutual,
     )
-    truth = network_motion(
-        points, torch.from_numpy(pair.T_target_source), pair.voxel_size, network.unit_voxels
+    return Sample((inputs,), labels, truth)
+
+
+def choose_motions(
+    pair: TrainingPair, count: int, rng: np.random.Generator | None
+) -> tuple[FloatArray, BoolArray]:
+    """At most ``count`` of a pair's motions (K, 4, 4), and which are right (K,).
+
+    With ``rng``: a right one where there is any, the first two, and others at random. Right: rotation
+    error below 15 degrees and translation error below 6 voxels, 30 cm at 5 cm voxels.
+
+    Raises:
+        InputError: the pair has no motions.
+    """
+    if pair.motions is None or len(pair.motions) == 0:
+        raise InputError("no motions to judge; make the data with 'geomoe3d data motions'")
+    T = pair.T_target_source
+    right = np.array(
+        [
+            rotation_error_deg(m, T) < MAX_ROTATION_DEG
+            and np.linalg.norm(m[:3, 3] - T[:3, 3]) < MAX_TRANSLATION_VOXELS * pair.voxel_size
+            for m in pair.motions
+        ]
     )
-    return Sample(inputs, torch.from_numpy(np.ascontiguousarray(pair.labels)), truth.float())
+    rows = np.arange(len(right))
+    if rng is not None and len(rows) > count:
+        good = np.flatnonzero(right)
+        first = [*(good[rng.integers(len(good))][None] if len(good) else []), 0, 1]
+        rows = np.array(list(dict.fromkeys([*first, *rng.permutation(len(right))])))
+    rows = np.sort(rows[:count])
+    return pair.motions[rows], right[rows]
 
 
 def make_batch(samples: list[Sample]) -> Batch:
     """Stack samples."""
     longest = max(len(s.labels) for s in samples)
+    counts = [len(s.inputs) for s in samples]
+    pair = torch.repeat_interleave(torch.arange(len(samples)), torch.tensor(counts))
     labels = torch.stack([torch.nn.functional.pad(s.labels, (0, longest - len(s.labels))) for s in samples])
-    return Batch(collate([s.input for s in samples]), labels, torch.stack([s.truth for s in samples]))
+    truth = torch.stack([s.truth for s in samples])
+    right = [s.right for s in samples if s.right is not None]
+    return Batch(
+        collate([one for s in samples for one in s.inputs]),
+        labels[pair],
+        truth[pair],
+        torch.cat(right) if right else None,
+        pair,
+    )
 
 
 class TrainingSamples(Dataset[Sample]):
@@ -120,7 +203,7 @@ class TrainingSamples(Dataset[Sample]):
         rng = np.random.default_rng([self.config.seed, 77, number])
         changed = augment(pair, data.augmentation, data.correspondences, rng)
         try:
-            return make_sample(changed, self.config.network)
+            return make_sample(changed, self.config.network, data, rng)
         except InputError as error:
             raise type(error)(f"training pair {self._index(number)}: {error}") from None
 
@@ -177,7 +260,7 @@ def validation_samples(config: TrainConfig) -> list[Sample]:
         rows = config.data.correspondences
         if rows is not None and len(pair) > rows:
             pair = pair.take(np.random.default_rng([5, index]).permutation(len(pair))[:rows])
-        samples.append(make_sample(pair, config.network))
+        samples.append(make_sample(pair, config.network, config.data))
     return samples
 
 

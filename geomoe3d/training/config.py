@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from geomoe3d.config import Section, build_config, read_yaml, set_keys
 from geomoe3d.filters.architecture import NetworkConfig
@@ -26,6 +26,12 @@ class DataConfig(Section):
     train: str = Field("synthetic", description="synthetic, or a folder of shards")
     validation: str = Field("synthetic", description="synthetic (other rooms), or a folder of shards")
     correspondences: int | None = Field(1000, ge=3, description="most per training pair; None: all")
+    motions_per_pair: int = Field(
+        8, ge=2, description="motions looked at per pair, by networks that judge motions"
+    )
+    hidden_viewpoints: float = Field(
+        0.1, ge=0, le=1, description="share of those pairs whose sensors' places are kept from the network"
+    )
     prefetch: int = Field(4, ge=1, description="batches that each worker prepares ahead")
     synthetic: SyntheticConfig = SyntheticConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
@@ -51,7 +57,9 @@ class ValidationConfig(Section):
 
     every: int = Field(500, ge=1, description="steps")
     num_pairs: int = Field(64, ge=1)
-    best_metric: Literal["recall", "f1"] = Field("recall", description="what `best` is chosen by")
+    best_metric: Literal["recall", "f1", "verdict"] = Field(
+        "recall", description="what `best` is chosen by; verdict: for networks that judge motions"
+    )
 
 
 class LoggingConfig(Section):
@@ -83,6 +91,18 @@ class TrainConfig(Section):
     optimizer: OptimizerConfig = OptimizerConfig()
     validation: ValidationConfig = ValidationConfig()
     logging: LoggingConfig = LoggingConfig()
+
+    @model_validator(mode="after")
+    def _check(self) -> TrainConfig:
+        given = self.data.augmentation
+        if self.network.judges_motions and (given.rotate or given.swap or given.jitter):
+            raise ValueError(
+                "a network that judges motions is trained with data.augmentation.rotate=false, swap=0 and "
+                "jitter=0: its channels do not change with rotation, and the others would not fit the motions"
+            )
+        if self.validation.best_metric == "verdict" and not self.network.judges_motions:
+            raise ValueError("validation.best_metric=verdict is for networks that judge motions")
+        return self
 
 
 def load_train_config(path: str | None = None, assignments: list[str] | None = None) -> TrainConfig:

@@ -36,6 +36,7 @@ class LossConfig(Section):
     )
     virtual_points: int = Field(4, ge=2, description="per edge of the lattice in the source's box")
     balance_weight: float = Field(0.01, ge=0)
+    verdict_weight: float = Field(1.0, ge=0, description="of the verdict, for networks that judge motions")
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Losses:
         regression: scalar, summed over layers, before its weight.
         balance: scalar, mean over layers.
         num_unsolved: layer-pairs left out of the regression because their weights fix no motion.
+        verdict: scalar, 0 for a network that judges no motions.
     """
 
     total: Tensor
@@ -55,6 +57,36 @@ class Losses:
     regression: Tensor
     balance: Tensor
     num_unsolved: Tensor
+    verdict: Tensor
+
+
+def verdict_loss(verdict: Tensor, right: Tensor, pair: Tensor) -> Tensor:
+    """That a right motion is preferred to the wrong ones of its pair, and believed as far as is right.
+
+    Args:
+        verdict: (B,) logits.
+        right: (B,) bool.
+        pair: (B,) int64, which of P pairs each belongs to.
+
+    Returns:
+        Scalar: mean over pairs with a right and a wrong motion of -log sum_right softmax(verdict), plus the
+        mean binary cross-entropy over all motions.
+    """
+    verdict = verdict.float()
+    num = int(pair.max()) + 1
+    table = verdict.new_full((num, len(pair)), -torch.inf)
+    of_right = table.clone()
+    columns = torch.arange(len(pair), device=pair.device)
+    table = table.index_put((pair, columns), verdict)
+    chosen = right.nonzero()[:, 0]
+    of_right = of_right.index_put((pair[chosen], columns[chosen]), verdict[chosen])
+    good = torch.zeros(num, device=pair.device).index_add(0, pair, right.float())
+    bad = torch.zeros(num, device=pair.device).index_add(0, pair, (~right).float())
+    both = (good > 0) & (bad > 0)
+    preference = verdict.new_zeros(())
+    if bool(both.any()):
+        preference = (table[both].logsumexp(1) - of_right[both].logsumexp(1)).mean()
+    return preference + F.binary_cross_entropy_with_logits(verdict, right.float())
 
 
 def classification_loss(logits: Tensor, labels: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -153,6 +185,8 @@ def total_loss(
     mask: Tensor | None,
     config: LossConfig,
     progress: float,
+    right: Tensor | None = None,
+    pair: Tensor | None = None,
 ) -> Losses:
     """All terms at ``progress`` (0 to 1) of the schedule; before the warm-up ends no motion is solved."""
     classification = classification_loss(output.logits, labels, mask).sum()
@@ -163,4 +197,8 @@ def total_loss(
         per_layer, unsolved = regression_loss(output.logits, coordinates, truth, virtual, config)
         regression = per_layer.sum()
     total = classification + config.regression_weight * regression + config.balance_weight * output.balance
-    return Losses(total, classification, regression, output.balance, unsolved)
+    verdict = classification.new_zeros(())
+    if output.verdict is not None and right is not None and pair is not None:
+        verdict = verdict_loss(output.verdict, right, pair)
+        total = total + config.verdict_weight * verdict
+    return Losses(total, classification, regression, output.balance, unsolved, verdict)

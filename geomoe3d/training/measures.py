@@ -12,10 +12,7 @@ from torch import Tensor
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.geometry.kabsch import weighted_kabsch
-from geomoe3d.training.batches import Batch, Sample, make_batch
-
-MAX_ROTATION_DEG = 15.0
-MAX_TRANSLATION_VOXELS = 6.0
+from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch
 
 
 def label_measures(logits: Tensor, labels: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
@@ -59,7 +56,11 @@ def measure_batch(logits: Tensor, batch: Batch, unit_voxels: float) -> dict[str,
 def evaluate(
     model: GeoMoE, samples: list[Sample], device: torch.device, batch_size: int = 8
 ) -> dict[str, float]:
-    """Mean measures over samples, with the model in evaluation mode (and put back)."""
+    """Mean measures over samples, with the model in evaluation mode (and put back).
+
+    For a network that judges motions they are those of the motion that it likes best, ``verdict_recall``
+    being the share of pairs where that motion is right.
+    """
     was_training = model.training
     model.eval()
     collected: dict[str, list[Tensor]] = {}
@@ -67,7 +68,21 @@ def evaluate(
         batch = make_batch(samples[start : start + batch_size]).to(device)
         inputs = batch.input
         output = model(inputs.coordinates, inputs.channels, inputs.neighbors, inputs.mask)
-        for name, values in measure_batch(output.logits[-1], batch, model.config.unit_voxels).items():
+        measures = measure_batch(output.logits[-1], batch, model.config.unit_voxels)
+        if output.verdict is not None and batch.right is not None:
+            chosen = best_of_pair(output.verdict, batch.pair)
+            measures = {name: values[chosen] for name, values in measures.items()}
+            measures["verdict_recall"] = batch.right[chosen].double()
+        for name, values in measures.items():
             collected.setdefault(name, []).append(values.cpu())
     model.train(was_training)
     return {name: float(torch.cat(values).mean()) for name, values in collected.items()}
+
+
+def best_of_pair(verdict: Tensor, pair: Tensor) -> Tensor:
+    """Of inputs (B,) grouped by pair (B,), the one with the largest verdict in each pair, by pair."""
+    order = verdict.argsort(descending=True, stable=True)
+    order = order[pair[order].argsort(stable=True)]
+    first = torch.ones_like(order, dtype=torch.bool)
+    first[1:] = pair[order][1:] != pair[order][:-1]
+    return order[first]

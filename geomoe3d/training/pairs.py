@@ -12,7 +12,7 @@ import json
 import secrets
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +23,7 @@ from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.types import BoolArray, Float32Array, FloatArray
 
 OPTIONAL_CHANNELS = ("feature_distance", "ratio", "mutual")
+_OF_MOTIONS = ("motions", "motion_start", "viewpoints")
 _REQUIRED = ("start", "correspondences", "labels", "T_target_source", "voxel_size")
 
 
@@ -38,6 +39,9 @@ class TrainingPair:
         feature_distance: (N,) float32 or None.
         ratio: (N,) float32 or None.
         mutual: (N,) bool or None.
+        motions: (K, 4, 4) float64 motions proposed for the pair, best first, or None; for networks that
+            judge motions.
+        viewpoints: (2, 3) places of the source's and the target's sensor, or None where not known.
     """
 
     correspondences: Float32Array
@@ -47,19 +51,19 @@ class TrainingPair:
     feature_distance: Float32Array | None = None
     ratio: Float32Array | None = None
     mutual: BoolArray | None = None
+    motions: FloatArray | None = None
+    viewpoints: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.correspondences)
 
     def take(self, rows: NDArray[Any]) -> TrainingPair:
         """The given rows (index or mask), channels included."""
-        extra = {
+        extra: dict[str, Any] = {
             name: None if (values := getattr(self, name)) is None else values[rows]
             for name in OPTIONAL_CHANNELS
         }
-        return TrainingPair(
-            self.correspondences[rows], self.labels[rows], self.T_target_source, self.voxel_size, **extra
-        )
+        return replace(self, correspondences=self.correspondences[rows], labels=self.labels[rows], **extra)
 
 
 class PairDataset(Protocol):
@@ -84,7 +88,8 @@ class ShardFolder:
     A shard is a folder of ``.npy`` files (mapped, recommended for large data) or one ``.npz`` file (loaded
     whole at first use) with ``correspondences`` (sum N, 6) float32, ``start`` (P+1,) row offsets,
     ``labels`` (sum N,) bool, ``T_target_source`` (P, 4, 4) float64, ``voxel_size`` (P,) and optionally
-    ``feature_distance``, ``ratio`` and ``mutual`` (sum N,).
+    ``feature_distance``, ``ratio`` and ``mutual`` (sum N,), ``motions`` (sum K, 4, 4) with ``motion_start``
+    (P+1,), and ``viewpoints`` (P, 2, 3).
 
     Raises:
         InputError: the folder is missing or holds no shard.
@@ -116,6 +121,11 @@ class ShardFolder:
         i = index - int(self._first[shard])
         rows = slice(int(arrays["start"][i]), int(arrays["start"][i + 1]))
         extra = {name: np.array(arrays[name][rows]) for name in OPTIONAL_CHANNELS if name in arrays}
+        if "motions" in arrays:
+            few = slice(int(arrays["motion_start"][i]), int(arrays["motion_start"][i + 1]))
+            extra["motions"] = np.array(arrays["motions"][few])
+        if "viewpoints" in arrays:
+            extra["viewpoints"] = np.array(arrays["viewpoints"][i])
         return TrainingPair(
             np.array(arrays["correspondences"][rows], dtype=np.float32),
             np.array(arrays["labels"][rows], dtype=bool),
@@ -146,7 +156,7 @@ class ShardFolder:
     def _arrays(self, shard: int) -> dict[str, NDArray[Any]]:
         if shard not in self._open:
             path = self._paths[shard]
-            arrays = _read(path, (*_REQUIRED, *OPTIONAL_CHANNELS))
+            arrays = _read(path, (*_REQUIRED, *OPTIONAL_CHANNELS, *_OF_MOTIONS))
             _check_shard(path, arrays)
             self._open[shard] = arrays
         return self._open[shard]
@@ -175,12 +185,14 @@ def write_shard(path: str | Path, pairs: Sequence[TrainingPair]) -> None:
         "T_target_source": np.stack([p.T_target_source for p in pairs]).astype(np.float64),
         "voxel_size": np.array([p.voxel_size for p in pairs], dtype=np.float64),
     }
-    for name in OPTIONAL_CHANNELS:
+    for name in (*OPTIONAL_CHANNELS, "motions", "viewpoints"):
         given = [values for p in pairs if (values := getattr(p, name)) is not None]
         if given and len(given) < len(pairs):
             raise InputError(f"{len(given)} of {len(pairs)} pairs have '{name}'; all or none must")
         if given:
-            arrays[name] = np.concatenate(given)
+            arrays[name] = np.stack(given) if name == "viewpoints" else np.concatenate(given)
+        if given and name == "motions":
+            arrays["motion_start"] = np.cumsum([0, *map(len, given)]).astype(np.int64)
     temporary = path.with_name(f".writing-{secrets.token_hex(8)}")
     try:
         temporary.mkdir()
@@ -220,6 +232,13 @@ def _check_shard(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     }
     expected |= {"labels": (num_rows,), "voxel_size": (num_pairs,)}
     expected |= {name: (num_rows,) for name in OPTIONAL_CHANNELS if name in arrays}
+    if "motions" in arrays:
+        if "motion_start" not in arrays:
+            raise FormatError(f"shard '{path}' has motions but lacks motion_start")
+        num_motions = int(arrays["motion_start"][-1])
+        expected |= {"motion_start": (num_pairs + 1,), "motions": (num_motions, 4, 4)}
+    if "viewpoints" in arrays:
+        expected["viewpoints"] = (num_pairs, 2, 3)
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise FormatError(f"shard '{path}': {name} has shape {arrays[name].shape}, expected {shape}")

@@ -12,9 +12,9 @@ from geomoe3d.training.logs import CsvLog, TensorBoardLog
 
 _TRAIN_COLUMNS = [
     "loss", "classification", "regression", "balance", "precision", "recall", "f1", "kept_fraction",
-    "router_entropy", "unsolved", "gradient_norm", "learning_rate", "skipped", "pairs_per_s",
+    "router_entropy", "verdict", "unsolved", "gradient_norm", "learning_rate", "skipped", "pairs_per_s",
 ]  # fmt: skip
-_VALIDATION_COLUMNS = ["precision", "recall", "f1", "registration_recall", "best"]
+_VALIDATION_COLUMNS = ["precision", "recall", "f1", "registration_recall", "verdict_recall", "best"]
 
 
 class Reporter(Protocol):

@@ -35,7 +35,15 @@ def batch_loss(output: GeoMoEOutput, batch: Batch, config: TrainConfig, progress
     """All losses of a batch."""
     inputs = batch.input
     return total_loss(
-        output, inputs.coordinates, batch.labels, batch.truth, inputs.mask, config.loss, progress
+        output,
+        inputs.coordinates,
+        batch.labels,
+        batch.truth,
+        inputs.mask,
+        config.loss,
+        progress,
+        batch.right,
+        batch.pair,
     )
 
 
@@ -145,6 +153,7 @@ def _measures(output: GeoMoEOutput, losses: Losses, batch: Batch) -> dict[str, f
         "classification": losses.classification,
         "regression": losses.regression,
         "balance": losses.balance,
+        "verdict": losses.verdict,
         "unsolved": losses.num_unsolved,
         **{name: x.mean() for name, x in labels.items()},
         "kept_fraction": output.kept_fraction[-1],

@@ -190,7 +190,7 @@ class TrainingRun:
     def _validate(self, samples: list[Any], logs: RunLogs, reporter: Reporter) -> None:
         progress, config = self.progress, self.config
         measures = evaluate(self.shipped, samples, self.device)
-        key = "registration_recall" if config.validation.best_metric == "recall" else "f1"
+        key = _BEST_MEASURE[config.validation.best_metric]
         # Ties in a small validation set are common; F1 decides between equal recalls.
         rank = (measures[key], measures["f1"])
         best = not progress.best or rank > (progress.best[key], progress.best["f1"])
@@ -272,6 +272,9 @@ class TrainingRun:
             raise OutputError(f"'{self.folder}' holds a run already; give another folder, or leave --fresh")
         if not self.last_path.exists() and (self.folder / "weights.safetensors").exists():
             raise OutputError(f"'{self.folder}' holds weights but no run to go on with; give another folder")
+
+
+_BEST_MEASURE = {"recall": "registration_recall", "f1": "f1", "verdict": "verdict_recall"}
 
 
 def _yaml(config: TrainConfig) -> str:

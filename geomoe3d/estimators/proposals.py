@@ -1,0 +1,40 @@
+"""What an estimator proposes for a pair: from all correspondences, and from the mutual ones alone.
+
+The second round costs little and often holds the right motion where one-way matches drown it. Place: solve.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomoe3d.config import EstimatorConfig
+from geomoe3d.estimators.base import Estimator
+from geomoe3d.types import Correspondences, FloatArray, Hypothesis
+
+
+def propose(
+    estimate: Estimator,
+    matched: Correspondences,
+    weights: FloatArray,
+    config: EstimatorConfig,
+    *,
+    inlier_threshold: float,
+    seed: int,
+) -> list[Hypothesis]:
+    """Hypotheses of both rounds, those of the first round first, each round best first.
+
+    Args:
+        estimate: what proposes.
+        matched: N correspondences; without the attribute ``mutual`` there is one round.
+        weights: (N,) what a filter says of them.
+        config: weight of one-way matches, and whether there is a second round.
+        inlier_threshold: cloud units.
+        seed: decides every random choice.
+    """
+    if matched.mutual is not None:
+        weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
+    found = estimate(matched.points, weights, inlier_threshold=inlier_threshold, seed=seed)
+    if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
+        rows = matched.mutual
+        found += estimate(matched.points[rows], weights[rows], inlier_threshold=inlier_threshold, seed=seed)
+    return found

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from geomoe3d.config import RegistrationConfig
+from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import inverse, residuals, rotation_angle_deg, shift_frames, transform_points
 from geomoe3d.judge import Information, Judgement
 from geomoe3d.result import Alternative, CloudReport, RegistrationResult
@@ -27,6 +28,7 @@ class Findings:
         alternative: the best clearly different motion, or None.
         lead: score of the answer over that of the alternative, see `judge.lead_over`.
         evidence, information, judgement: see their classes; evidence None where there was no hypothesis.
+        weighed: what a network said of the correspondences under the answer, or None without one.
     """
 
     T_target_source: FloatArray
@@ -35,6 +37,7 @@ class Findings:
     evidence: Evidence | None
     information: Information
     judgement: Judgement
+    weighed: FilterOutput | None = None
 
     @classmethod
     def nothing(cls, reason: str) -> Findings:
@@ -70,7 +73,7 @@ def finished_result(
         reasons=findings.judgement.reasons,
         confidence=findings.judgement.confidence,
         overlap=findings.evidence.overlap if findings.evidence else 0.0,
-        evidence={**asdict(findings.evidence), "score": findings.evidence.score} if findings.evidence else {},
+        evidence=_evidence(findings.evidence) if findings.evidence else {},
         num_correspondences=len(matched),
         num_inliers=int((findings.residuals(matched) < threshold).sum()),
         inlier_threshold=threshold,
@@ -144,6 +147,12 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
         except PackageNotFoundError:
             continue
     return tuple(versions.items())
+
+
+def _evidence(evidence: Evidence) -> dict[str, float]:
+    """Its numbers by name; without a network there is no verdict."""
+    values = {name: value for name, value in asdict(evidence).items() if value is not None}
+    return {**values, "score": evidence.score}
 
 
 def _alternative(findings: Findings, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:

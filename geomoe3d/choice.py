@@ -6,13 +6,16 @@ so the choice among them does not depend on where they came from.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.answer import Findings
 from geomoe3d.config import RegistrationConfig
+from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import check_motion, residuals, shift_frames
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import Refiner
@@ -20,8 +23,12 @@ from geomoe3d.stages import StageClock
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PreparedCloud
 from geomoe3d.verification import Evidence, Verifier, best_first, clearly_different, distinct
 
+if TYPE_CHECKING:
+    from geomoe3d.filters.motion_judge import Judged
+
 _CLOSE_LEAD = 2.0
 _KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
+_UNSEEN_VERDICT = -3.0  # of a hypothesis that the network was not shown, as the clouds like others better
 _DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two motions are different
 
 
@@ -41,7 +48,8 @@ class Chooser:
         matched: correspondences on this grid, of which a right answer has its share.
         threshold: largest distance of points on the same surface, cloud units.
         config: of the registration.
-        clock: told of the stages verify, refine and judge.
+        clock: told of the stages weigh, verify, refine and judge.
+        network: what a learned judge says of motions (K, 4, 4), one each, or None without one.
     """
 
     def __init__(
@@ -51,9 +59,11 @@ class Chooser:
         threshold: float,
         config: RegistrationConfig,
         clock: StageClock,
+        network: Callable[[FloatArray], list[Judged]] | None = None,
     ) -> None:
         self._described, self._matched, self._threshold = described, matched, threshold
-        self._config, self._clock = config, clock
+        self._config, self._clock, self._network = config, clock, network
+        self._weighed: list[tuple[FloatArray, FilterOutput]] = []
         clock("verify")
         self._verifier = Verifier(*described, threshold, seed=config.seed)
         self._refiner = Refiner(*described, config.refinement)
@@ -74,12 +84,16 @@ class Chooser:
         refined, _ = self._refiner(T)
         self.consider([Hypothesis(motion, 0.0, 0) for motion in (T, refined)])
 
-    def conclude(self, num_refined: int = 1) -> Findings:
+    def conclude(self, num_refined: int = 1, num_judged: int = 3) -> Findings:
         """The best of all hypotheses so far, and how sure.
 
         Args:
             num_refined: so many of the best distinct hypotheses are refined before the choice.
+            num_judged: so many that the clouds like best are shown to the network, if there is one.
         """
+        if self._network is not None and self._config.verification.enabled:
+            self._clock("weigh")
+            self._ask(self._network, num_judged)
         self._clock("refine")
         answer = self._answer(num_refined)
         self._clock("judge")
@@ -90,22 +104,52 @@ class Chooser:
         information = measure_information(T, source, target, self._threshold)
         support = self._support(T)
         judgement = judge(answer.evidence, lead, support, information, self._config.judgement)
-        findings = Findings(T, other, lead, answer.evidence, information, judgement)
+        findings = Findings(T, other, lead, answer.evidence, information, judgement, self._weights_under(T))
         return findings if answer.note is None else findings.with_note(answer.note)
+
+    def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
+        """Get the network's verdicts on the distinct hypotheses that the clouds like best, and rank anew."""
+        by_clouds = sorted(self._ranked, key=lambda pair: -pair[1].surface_score)
+        best = distinct(by_clouds, self._described[0], self._shift, count)
+        shown = [h for h in best if h.verdict is None]
+        judged = network(np.array([h.T_target_source for h in shown])) if shown else []
+        said = {id(h): found for h, found in zip(shown, judged, strict=False)}
+        ranked = []
+        for hypothesis, evidence in self._ranked:
+            found = said.get(id(hypothesis))
+            if found is not None:
+                self._weighed.append((hypothesis.T_target_source, found.output))
+                hypothesis = replace(hypothesis, verdict=found.verdict)
+            verdict = _UNSEEN_VERDICT if hypothesis.verdict is None else hypothesis.verdict
+            ranked.append((hypothesis, replace(evidence, verdict=verdict)))
+        self._ranked = best_first(ranked)
+
+    def _weights_under(self, T_target_source: FloatArray) -> FilterOutput | None:
+        """What the network said of the correspondences under the motion nearest to the answer, or None."""
+        if not self._weighed:
+            return None
+        return min(self._weighed, key=lambda entry: float(np.abs(entry[0] - T_target_source).sum()))[1]
 
     def _answer(self, num_refined: int) -> Refined | None:
         """The motion that the clouds, or without verification the correspondences, like best, refined."""
         if self._first is None:
             return None
         if not self._config.verification.enabled:
-            return self._refine(self._first.T_target_source)
+            return self._refine(self._first.T_target_source, None)
         best = distinct(self._ranked, self._described[0], self._shift, num_refined)
-        return max((self._refine(h.T_target_source) for h in best), key=lambda found: found.evidence.score)
+        verdicts = {id(h): evidence.verdict for h, evidence in self._ranked}
+        refined = (self._refine(h.T_target_source, verdicts[id(h)]) for h in best)
+        return max(refined, key=lambda found: found.evidence.score)
 
-    def _refine(self, T_target_source: FloatArray) -> Refined:
-        """The motion refined on the clouds, or as it was where that made them fit less well."""
+    def _refine(self, T_target_source: FloatArray, verdict: float | None) -> Refined:
+        """The motion refined on the clouds, or as it was where that made them fit less well.
+
+        The network's ``verdict`` on the motion before holds for the refined one too.
+        """
         T, note = self._refiner(T_target_source)
-        before, after = self._verifier.evidence(T_target_source), self._verifier.evidence(T)
+        before, after = (
+            replace(self._verifier.evidence(motion), verdict=verdict) for motion in (T_target_source, T)
+        )
         if after.score < _KEPT_EVIDENCE * before.score:
             note = "refinement made the clouds fit less well; the unrefined motion is given"
             return Refined(T_target_source, before, note)
@@ -117,7 +161,7 @@ class Chooser:
         other = clearly_different(self._ranked, T, source, self._shift)
         lead = lead_over(answer.evidence, other[1] if other else None)
         if other is not None and lead < _CLOSE_LEAD:  # a fair race: the rival is refined too
-            rival = self._refine(other[0].T_target_source)
+            rival = self._refine(other[0].T_target_source, other[1].verdict)
             if rival.evidence.score > other[1].score:
                 moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
                 other = clearly_different([moved], T, source, self._shift) or other

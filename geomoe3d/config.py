@@ -103,6 +103,11 @@ class SecondLookConfig(Section):
     num_refined: int = Field(
         3, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
     )
+    num_judged: int = Field(
+        8,
+        ge=1,
+        description="so many of the best distinct hypotheses are shown to the network, if there is one",
+    )
 
     @field_validator("grids")
     @classmethod

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +33,9 @@ from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
 from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
+
+if TYPE_CHECKING:
+    from geomoe3d.filters.motion_judge import Judged, MotionJudge
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class Registrar:
         self._filter: Filter = make_filter(
             self.config.filter.name, self.config.filter.weights, self.config.estimator
         )
+        self._judge: MotionJudge | None = getattr(self._filter, "as_judge", None)
         self._estimator: Estimator = make_estimator(self.config.estimator)
 
     @classmethod
@@ -151,7 +155,9 @@ class Registrar:
         described = self.describe(*clouds, voxel_size, clock)
         matched, weighed, hypotheses = self.propose(described, clock)
         with single_blas_thread():
-            chooser = Chooser(described, matched, threshold, config, clock)
+            chooser = Chooser(
+                described, matched, threshold, config, clock, self._ask_about(matched, voxel_size)
+            )
             chooser.consider(hypotheses)
             if initial is not None:
                 chooser.consider_guess(initial)
@@ -159,12 +165,13 @@ class Registrar:
             if findings.judgement.status != "ok" and config.verification.enabled and config.second_look.grids:
                 for grid in config.second_look.grids:
                     chooser.consider(self.propose_on_grid(grid * voxel_size, described, clock))
-                findings = chooser.conclude(config.second_look.num_refined)
+                findings = chooser.conclude(config.second_look.num_refined, config.second_look.num_judged)
         if voxel_size > wanted:
             findings = findings.with_note(
                 f"a voxel size of {wanted:.4g} gives more than {config.preparation.max_points} voxels; "
                 f"{voxel_size:.4g} was used (preparation.max_points sets the limit)"
             )
+        weighed = findings.weighed or weighed
         result = finished_result(described, matched, findings, config, threshold, clock.stop())
         inliers = findings.residuals(matched) < threshold
         return Explanation(result, *clouds, matched, weighed, inliers)
@@ -203,7 +210,10 @@ class Registrar:
         clock("match")
         matched = match(*described, config.matching, seed=config.seed)
         clock("weigh")
-        weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
+        if self._judge is None:
+            weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
+        else:  # it is shown the motions that the clouds like best, later
+            weighed = FilterOutput(np.ones(len(matched)))
         clock("solve")
         threshold = config.estimator.inlier_threshold * voxel_size
         return matched, weighed, self.solve(matched, weighed, threshold)
@@ -225,18 +235,24 @@ class Registrar:
         return self.propose((source, target), clock)[2]
 
     def solve(self, matched: Correspondences, weighed: FilterOutput, threshold: float) -> list[Hypothesis]:
-        """Hypotheses: those that the filter has judged already, or what the estimator proposes."""
-        config = self.config.estimator
-        if weighed.hypotheses and config.name == "consensus":
-            return list(weighed.hypotheses)
+        """What the estimator proposes for weighted correspondences."""
         return propose(
             self._estimator,
             matched,
             weighed.weights,
-            config,
+            self.config.estimator,
             inlier_threshold=threshold,
             seed=self.config.seed,
         )
+
+    def _ask_about(
+        self, matched: Correspondences, voxel_size: float
+    ) -> Callable[[FloatArray], list[Judged]] | None:
+        """The network's opinion of motions of these correspondences, or None without a network for that."""
+        judge = self._judge
+        if judge is None:
+            return None
+        return lambda motions: judge.judge(matched, motions, voxel_size=voxel_size)
 
 
 def register(

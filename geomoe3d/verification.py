@@ -23,6 +23,8 @@ from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 _NUM_RANDOM = 256  # random target features per source point: p-values down to 1/257
 _LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
 _VIOLATION_WEIGHT = 10.0  # a tenth of the visible points in free space divides the score by e
+_VERDICT_WEIGHT = 0.5
+_MOST_VERDICT = 8.0
 _VISIBLE_FLOOR = 0.05  # fewer visible points than this share make the violation rate unreliable
 
 
@@ -37,18 +39,29 @@ class Evidence:
             points and 0 for the others; about zero for chance overlap, larger is better.
         free_space_violation: share of source points in target's free space over those it could see, plus
             the same with the roles exchanged; 0 where a viewpoint is neither known nor guessed.
-        score: distinctiveness x exp(-10 free_space_violation), not below zero.
+        verdict: logit by which a network believes in the motion, or None without one.
+        surface_score: distinctiveness x exp(-10 free_space_violation), not below zero.
+        score: surface_score x exp(verdict / 2), the verdict bounded to [-8, 8]; surface_score without one.
     """
 
     overlap: float
     agreement: float
     distinctiveness: float
     free_space_violation: float
+    verdict: float | None = None
+
+    @property
+    def surface_score(self) -> float:
+        """See the class; what the clouds alone say."""
+        return max(self.distinctiveness, 0.0) * float(np.exp(-_VIOLATION_WEIGHT * self.free_space_violation))
 
     @property
     def score(self) -> float:
         """See the class; the quantity by which hypotheses are chosen."""
-        return max(self.distinctiveness, 0.0) * float(np.exp(-_VIOLATION_WEIGHT * self.free_space_violation))
+        if self.verdict is None:
+            return self.surface_score
+        verdict = min(max(self.verdict, -_MOST_VERDICT), _MOST_VERDICT)
+        return self.surface_score * float(np.exp(_VERDICT_WEIGHT * verdict))
 
 
 class Verifier:

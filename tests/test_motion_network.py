@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.config import ConfigError, EstimatorConfig, build_config
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import CheckpointError, FormatError, InputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.filters.aligned import CHANNELS, AlignedChannels
@@ -22,6 +22,7 @@ from geomoe3d.filters.folded import FoldedGeoMoE
 from geomoe3d.filters.geomoe import PRIOR_KERNEL, GeoMoE
 from geomoe3d.filters.geomoe_filter import GeoMoEFilter
 from geomoe3d.filters.inputs import collate, motion_inputs, pair_input
+from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
 from geomoe3d.training.batches import choose_motions, make_batch, make_sample
 from geomoe3d.training.config import DataConfig, TrainConfig, load_train_config
@@ -273,28 +274,45 @@ def test_settings_that_do_not_fit_a_network_that_judges_motions_are_refused() ->
 
 def test_filter_judges_what_consensus_proposes() -> None:
     rows, _ = scene(4)
-    found = GeoMoEFilter(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
+    found = MotionJudge(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
     assert found.hypotheses
     verdicts = [h.verdict for h in found.hypotheses if h.verdict is not None]
     assert verdicts == sorted(verdicts, reverse=True)
     assert found.weights.shape == (len(rows),)
     assert found.logits is not None
-    again = GeoMoEFilter(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
+    again = MotionJudge(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
     np.testing.assert_array_equal(again.weights, found.weights)
+
+
+def test_each_network_has_its_own_filter() -> None:
+    with pytest.raises(CheckpointError, match="MotionJudge"):
+        GeoMoEFilter(network())
+    with pytest.raises(CheckpointError, match="GeoMoEFilter"):
+        MotionJudge(GeoMoE(build_config(NetworkConfig, {"num_layers": 1, "width": 8, "num_heads": 2})))
+
+
+def test_mutual_rows_come_first() -> None:
+    rows, _ = scene(4)
+    mutual = np.arange(len(rows)) % 3 == 0
+    few = likeliest_rows(Correspondences(rows, mutual=mutual), 120)
+    assert few.mutual is not None
+    assert len(few) == 120
+    assert few.mutual.sum() == mutual.sum()
+    assert likeliest_rows(few, 120) is few
 
 
 def test_filter_without_any_motion_gives_no_weight() -> None:
     line = np.linspace(0, 1, 30)[:, None] * np.ones(6)
-    found = GeoMoEFilter(network())(Correspondences(line), voxel_size=VOXEL)
+    found = MotionJudge(network())(Correspondences(line), voxel_size=VOXEL)
     assert found.hypotheses == ()
     assert not found.weights.any()
-    assert not GeoMoEFilter(network())(Correspondences(np.zeros((0, 6))), voxel_size=VOXEL).weights.any()
+    assert not MotionJudge(network())(Correspondences(np.zeros((0, 6))), voxel_size=VOXEL).weights.any()
 
 
 def test_rows_that_are_not_finite_weigh_nothing() -> None:
     rows, _ = scene(4)
     rows[5, 2] = np.nan
-    found = GeoMoEFilter(network())(Correspondences(rows), voxel_size=VOXEL)
+    found = MotionJudge(network())(Correspondences(rows), voxel_size=VOXEL)
     assert found.hypotheses
     assert found.weights[5] == 0
 

@@ -201,7 +201,7 @@ def test_every_pair_is_seen_once_per_epoch_and_samples_do_not_depend_on_history(
     late = TrainingSamples(open_training(config), config)[17]
     for number in range(17):
         samples[number]
-    assert (samples[17].input.coordinates == late.input.coordinates).all()
+    assert (samples[17].inputs[0].coordinates == late.inputs[0].coordinates).all()
 
 
 def test_batches_of_unequal_pairs_are_padded() -> None:

@@ -37,6 +37,15 @@ class DrawSettings(Section):
     )
     usual_keypoints: int = Field(1000, ge=3, description="keypoints of most pairs")
     usual_share: float = Field(0.7, ge=0, le=1, description="share of pairs with the usual keypoints")
+    whole_share: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of pairs for which all points are matched and whole_kept matches kept",
+    )
+    whole_kept: int = Field(
+        1000, ge=3, description="matches kept of those, mutual ones first, as registration does"
+    )
     bands: tuple[float, ...] = Field((0.1, 0.3, 0.6, 1.01), description="edges of the overlap bands")
     band_shares: tuple[float, ...] = Field((0.4, 0.4, 0.2), description="how often each band is drawn")
     min_inliers: int = Field(3, ge=0, description="pairs with fewer true matches are drawn again")
@@ -66,12 +75,14 @@ class DrawnPair:
         labels: (N,) True where the residual under the true motion is below the inlier threshold.
         T_target_source: (4, 4) true motion.
         voxel_size: metres.
+        whole: True where all points were matched and the mutual matches taken first.
     """
 
     correspondences: Correspondences
     labels: BoolArray
     T_target_source: FloatArray
     voxel_size: float
+    whole: bool = False
 
 
 class FragmentPool:
@@ -150,7 +161,9 @@ class FragmentPool:
         scene = self._scene(int(self._owner[number]))
         place = int(self._place[number])
         i, j = (int(k) for k in scene.pair[place])
-        count = self._count(rng) if keypoints is None else keypoints
+        share = self.settings.whole_share
+        whole = keypoints is None and share > 0 and rng.random() < share
+        count = keypoints if keypoints is not None else _EVERY if whole else self._count(rng)
         return draw_pair(
             scene.fragment(i),
             scene.fragment(j),
@@ -159,6 +172,7 @@ class FragmentPool:
             count,
             self.settings.inlier_threshold,
             rng,
+            self.settings.whole_kept if whole else None,
         )
 
     def identity(self) -> str:
@@ -191,6 +205,7 @@ def draw_pair(
     keypoints: int,
     inlier_threshold: float,
     rng: np.random.Generator,
+    kept: int | None = None,
 ) -> DrawnPair:
     """Nearest neighbours of random keypoints, source to target, with their labels.
 
@@ -201,18 +216,21 @@ def draw_pair(
         voxel_size: cloud units.
         keypoints: drawn without replacement in each cloud; all where it has fewer.
         inlier_threshold: in voxels.
-        rng: decides the keypoints.
+        rng: decides the keypoints, and which matches are kept.
+        kept: matches kept at most, mutual ones first; None keeps all.
     """
     clouds = []
     for points, features in (source, target):
         rows = np.sort(rng.permutation(len(points))[:keypoints])
         clouds.append(_cloud(points[rows], features[rows], voxel_size))
-    found = match(clouds[0], clouds[1], _MATCHING)
+    matching = _MATCHING if kept is None else _MATCHING.model_copy(update={"max_correspondences": kept})
+    found = match(clouds[0], clouds[1], matching, seed=0 if kept is None else int(rng.integers(1 << 31)))
     residual = np.linalg.norm(transform_points(T_target_source, found.source) - found.target, axis=1)
     labels: BoolArray = residual < inlier_threshold * voxel_size
-    return DrawnPair(found, labels, T_target_source, voxel_size)
+    return DrawnPair(found, labels, T_target_source, voxel_size, kept is not None)
 
 
+_EVERY = 1 << 30
 _MATCHING = MatchingConfig(method="one_way", neighbors=1, max_correspondences=1_000_000)
 
 

@@ -2,34 +2,31 @@
 
 Weights are loaded once and folded for inference; calls share nothing and draw nothing at random. Rows with
 a NaN or infinite coordinate get weight 0. Cost: linear in N, about 30 ms at N = 1000 on two idle cores
-beside the inputs that the network asks for.
+beside the inputs that the network asks for. A network that judges motions is run by `MotionJudge`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from geomoe3d.config import EstimatorConfig
-from geomoe3d.estimators.consensus import ConsensusEstimator
-from geomoe3d.estimators.proposals import propose
-from geomoe3d.filters.base import FilterOutput
-from geomoe3d.filters.folded import FoldedGeoMoE
+from geomoe3d.errors import CheckpointError
+from geomoe3d.filters.architecture import NetworkConfig
+from geomoe3d.filters.base import Filter, FilterOutput
+from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, motion_inputs, pair_input
+from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, PairInput, pair_input
 from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
-from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
+from geomoe3d.types import Correspondences, FloatArray, IntArray
 
-MOST_MOTIONS = 16
-MOST_ROWS = 1000
+DEFAULT_WEIGHTS = "geomoe3d"
 
 
 @dataclass(frozen=True)
@@ -46,169 +43,115 @@ class Insight:
     expert: IntArray
     logits_per_layer: FloatArray
 
+    @classmethod
+    def blind(cls, num: int, num_layers: int) -> Insight:
+        """Nothing seen of N correspondences."""
+        return cls(np.full(num, -1), np.full(num, -1), np.full((num_layers, num), np.nan))
+
+    def fill(self, seen: IntArray, out: FoldedOutput) -> None:
+        """Write what the network said of the rows ``seen``."""
+        self.logits_per_layer[:, seen] = out.logits.cpu().numpy()
+        if out.sub_field is not None:
+            sub_field = out.sub_field.cpu().numpy()
+            self.sub_field[seen] = sub_field
+            if out.expert is not None:
+                self.expert[seen] = out.expert.cpu().numpy()[sub_field]
+
+    def output(self, config: NetworkConfig) -> FilterOutput:
+        """Weights relu(tanh(logit)), 0 where not seen; ``groups`` is the expert of each one's sub-field."""
+        logits = np.nan_to_num(self.logits_per_layer[-1], nan=-np.inf)
+        experts = config.num_experts if config.feed_forward == "moe" else 0
+        return FilterOutput(
+            weights=weights_from_logits(torch.from_numpy(logits)).numpy(),
+            logits=logits,
+            groups=np.where(self.expert < 0, experts, self.expert) if experts else None,
+            group_names=(*(f"expert {i + 1}" for i in range(experts)), "not seen") if experts else (),
+        )
+
 
 class GeoMoEFilter:
     """A network as `geomoe3d.filters.base.Filter`.
 
     Args:
-        model: trained; its weights are copied.
+        model: trained, not one that judges motions; its weights are copied.
         card: what it is, or None.
         device: where it runs.
-        estimator: what proposes motions to a network that judges some; None takes the defaults.
+
+    Raises:
+        CheckpointError: a network that judges motions.
     """
 
     def __init__(
-        self,
-        model: GeoMoE,
-        card: WeightCard | None = None,
-        device: str | torch.device = "cpu",
-        estimator: EstimatorConfig | None = None,
+        self, model: GeoMoE, card: WeightCard | None = None, device: str | torch.device = "cpu"
     ) -> None:
+        if model.config.judges_motions:
+            raise CheckpointError("this network judges motions; MotionJudge runs it, not GeoMoEFilter")
         self.config = model.config
         self.card = card
         self.device = torch.device(device)
         self._network = FoldedGeoMoE(model.to(self.device).eval())
-        self._proposing = estimator or EstimatorConfig()
 
     @classmethod
-    def from_pretrained(
-        cls,
-        name_or_path: str | Path,
-        device: str | torch.device = "cpu",
-        estimator: EstimatorConfig | None = None,
-    ) -> GeoMoEFilter:
+    def from_pretrained(cls, name_or_path: str | Path, device: str | torch.device = "cpu") -> GeoMoEFilter:
         """Load a .safetensors file with its card, or weights that ship with the package.
 
         Raises:
             CheckpointError: see `geomoe3d.filters.pretrained.load_pretrained`.
         """
         model, card = load_pretrained(name_or_path)
-        return cls(model, card, device, estimator)
+        return cls(model, card, device)
 
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
-        """Weigh correspondences; see `Filter`. ``groups`` is the expert of each one's sub-field.
+        """Weigh correspondences; see `Filter`.
 
         Returns:
-            Weights relu(tanh(logit)): 0 where the logit is negative. With fewer than 3 finite rows there
-            is nothing to go by: all weights 0.
+            See `Insight.output`. With fewer than 3 finite rows there is nothing to go by: all weights 0.
 
         Raises:
             InputError: the network was trained with a channel that these correspondences lack.
         """
-        hypotheses: tuple[Hypothesis, ...] = ()
-        if self.config.judges_motions:
-            hypotheses = tuple(self.judge(correspondences, voxel_size=voxel_size, seed=seed))
-        insight = self.look(correspondences, voxel_size=voxel_size, hypotheses=hypotheses)
-        logits = insight.logits_per_layer[-1]
-        weights = weights_from_logits(torch.from_numpy(np.nan_to_num(logits, nan=-np.inf))).numpy()
-        experts = self.config.num_experts if self.config.feed_forward == "moe" else 0
-        return FilterOutput(
-            weights=weights,
-            logits=np.nan_to_num(logits, nan=-np.inf),
-            groups=np.where(insight.expert < 0, experts, insight.expert) if experts else None,
-            group_names=(*(f"expert {i + 1}" for i in range(experts)), "not seen") if experts else (),
-            hypotheses=hypotheses,
-        )
+        return self.look(correspondences, voxel_size=voxel_size).output(self.config)
 
-    @torch.inference_mode()
-    def judge(
-        self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0
-    ) -> list[Hypothesis]:
-        """The motions that consensus proposes, those that the network likes best first.
-
-        At most ``MOST_MOTIONS`` are judged, on at most ``MOST_ROWS`` of the correspondences, mutual ones
-        first; the others follow in their order.
-        """
-        seen = correspondences.take(np.flatnonzero(np.isfinite(correspondences.points).all(axis=1)))
-        if len(seen) < MIN_CORRESPONDENCES:
-            return []
-        found = propose(
-            ConsensusEstimator(num_hypotheses=self._proposing.num_hypotheses),
-            seen,
-            np.ones(len(seen)),
-            self._proposing,
-            inlier_threshold=self.config.compatibility_threshold * voxel_size,
-            seed=seed,
-        )
-        if not found:
-            return []
-        few = found[:MOST_MOTIONS]
-        if len(seen) > MOST_ROWS:
-            first = np.arange(len(seen)) if seen.mutual is None else np.argsort(~seen.mutual, kind="stable")
-            seen = seen.take(np.sort(first[:MOST_ROWS]))
-        motions = np.array([h.T_target_source for h in few])
-        views = seen.viewpoints or (None, None)
-        verdicts = [
-            self._network(
-                one.coordinates.to(self.device), _on(one.channels, self.device), one.neighbors.to(self.device)
-            ).verdict
-            for one in motion_inputs(seen.points, motions, views, voxel_size, self.config)
-        ]
-        judged = [replace(h, verdict=float(v)) for h, v in zip(few, verdicts, strict=True) if v is not None]
-        return sorted(judged, key=lambda h: -(h.verdict or 0.0)) + found[MOST_MOTIONS:]
-
-    def look(
-        self,
-        correspondences: Correspondences,
-        *,
-        voxel_size: float,
-        hypotheses: Sequence[Hypothesis] = (),
-    ) -> Insight:
-        """Verdicts of all layers, sub-fields and experts, for drawing.
-
-        A network that judges motions looks at the correspondences under the first of ``hypotheses``, and
-        sees nothing without any.
-        """
-        num = len(correspondences)
-        result = Insight(np.full(num, -1), np.full(num, -1), np.full((self.config.num_layers, num), np.nan))
-        seen = np.flatnonzero(np.isfinite(correspondences.points).all(axis=1))
+    def look(self, correspondences: Correspondences, *, voxel_size: float) -> Insight:
+        """Verdicts of all layers, sub-fields and experts, for drawing."""
+        result = Insight.blind(len(correspondences), self.config.num_layers)
+        seen, part = finite_rows(correspondences)
         if len(seen) < MIN_CORRESPONDENCES:
             return result
-        part = correspondences if len(seen) == num else correspondences.take(seen)
-        if self.config.judges_motions:
-            if not hypotheses:
-                return result
-            motions = hypotheses[0].T_target_source[None]
-            views = part.viewpoints or (None, None)
-            inputs = motion_inputs(part.points, motions, views, voxel_size, self.config)[0]
-        else:
-            wanted = set(self.config.extra_channels)
-            given: dict[str, NDArray[Any] | None] = {
-                name: getattr(part, name)
-                for name in ("feature_distance", "ratio", "mutual")
-                if name in wanted
-            }
-            inputs = pair_input(part.points, voxel_size, self.config, **given)
-        channels = _on(inputs.channels, self.device)
-        out = self._network(
-            inputs.coordinates.to(self.device), channels, inputs.neighbors.to(self.device), insight=True
-        )
-        result.logits_per_layer[:, seen] = out.logits.cpu().numpy()
-        if out.sub_field is not None:
-            sub_field = out.sub_field.cpu().numpy()
-            result.sub_field[seen] = sub_field
-            if out.expert is not None:
-                result.expert[seen] = out.expert.cpu().numpy()[sub_field]
+        wanted = set(self.config.extra_channels)
+        given: dict[str, NDArray[Any] | None] = {
+            name: getattr(part, name) for name in ("feature_distance", "ratio", "mutual") if name in wanted
+        }
+        inputs = pair_input(part.points, voxel_size, self.config, **given)
+        result.fill(seen, run(self._network, inputs, self.device))
         return result
 
 
-def _on(channels: Tensor | None, device: torch.device) -> Tensor | None:
-    return None if channels is None else channels.to(device)
+def finite_rows(correspondences: Correspondences) -> tuple[IntArray, Correspondences]:
+    """The rows without NaN or infinity, and the correspondences of these rows."""
+    seen = np.flatnonzero(np.isfinite(correspondences.points).all(axis=1))
+    return seen, correspondences if len(seen) == len(correspondences) else correspondences.take(seen)
 
 
-def geomoe_filter(
-    weights: str | Path | None = None, estimator: EstimatorConfig | None = None
-) -> GeoMoEFilter:
-    """The filter named ``geomoe``.
+def run(network: FoldedGeoMoE, inputs: PairInput, device: torch.device) -> FoldedOutput:
+    """One pass with insight."""
+    channels = None if inputs.channels is None else inputs.channels.to(device)
+    return network(inputs.coordinates.to(device), channels, inputs.neighbors.to(device), insight=True)
+
+
+def geomoe_filter(weights: str | Path | None = None, estimator: EstimatorConfig | None = None) -> Filter:
+    """The filter named ``geomoe``: a `MotionJudge` or a `GeoMoEFilter`, as the weights ask for.
 
     Args:
         weights: name or path; None: the weights that ship with the package.
-        estimator: as in `GeoMoEFilter`.
+        estimator: what proposes motions to a network that judges some; None takes the defaults.
 
     Raises:
         CheckpointError: not found or not fitting; None and none ship with this version.
     """
-    return GeoMoEFilter.from_pretrained(DEFAULT_WEIGHTS if weights is None else weights, estimator=estimator)
+    from geomoe3d.filters.motion_judge import MotionJudge
 
-
-DEFAULT_WEIGHTS = "geomoe3d"
+    model, card = load_pretrained(DEFAULT_WEIGHTS if weights is None else weights)
+    if model.config.judges_motions:
+        return MotionJudge(model, card, estimator=estimator)
+    return GeoMoEFilter(model, card)

@@ -36,6 +36,9 @@ class LossConfig(Section):
     )
     virtual_points: int = Field(4, ge=2, description="per edge of the lattice in the source's box")
     balance_weight: float = Field(0.01, ge=0)
+    classification_form: Literal["balanced", "plain"] = Field(
+        "balanced", description="inliers and outliers weigh half each, as published, or every row alike"
+    )
     verdict_weight: float = Field(1.0, ge=0, description="of the verdict, for networks that judge motions")
 
 
@@ -89,13 +92,17 @@ def verdict_loss(verdict: Tensor, right: Tensor, pair: Tensor) -> Tensor:
     return preference + F.binary_cross_entropy_with_logits(verdict, right.float())
 
 
-def classification_loss(logits: Tensor, labels: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Balanced binary cross-entropy per pair, half for its inliers and half for its outliers.
+def classification_loss(
+    logits: Tensor, labels: Tensor, mask: Tensor | None = None, form: str = "balanced"
+) -> Tensor:
+    """Binary cross-entropy per pair: half for its inliers and half for its outliers, or plain.
 
     Args:
         logits: (..., B, N).
         labels: (B, N) bool, True for inliers.
         mask: (B, N) bool, False at padding, or None.
+        form: ``balanced``, or ``plain``: the mean over rows, for which a logit is 0 at a probability of one
+            half.
 
     Returns:
         (...) mean over pairs. A side without members contributes 0.
@@ -104,6 +111,9 @@ def classification_loss(logits: Tensor, labels: Tensor, mask: Tensor | None = No
         0.5 mean_pos softplus(-z) + 0.5 mean_neg softplus(z).
     """
     logits = logits.float()
+    if form == "plain":
+        cost = F.binary_cross_entropy_with_logits(logits, labels.float().expand_as(logits), reduction="none")
+        return cost.mean(-1).mean(-1) if mask is None else ((cost * mask).sum(-1) / mask.sum(-1)).mean(-1)
     positive = labels if mask is None else labels & mask
     negative = ~labels if mask is None else ~labels & mask
     halves = []
@@ -189,7 +199,7 @@ def total_loss(
     pair: Tensor | None = None,
 ) -> Losses:
     """All terms at ``progress`` (0 to 1) of the schedule; before the warm-up ends no motion is solved."""
-    classification = classification_loss(output.logits, labels, mask).sum()
+    classification = classification_loss(output.logits, labels, mask, config.classification_form).sum()
     regression = classification.new_zeros(())
     unsolved = torch.zeros((), dtype=torch.int64, device=classification.device)
     if config.regression_weight > 0 and progress >= config.regression_warmup:

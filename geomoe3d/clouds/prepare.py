@@ -17,6 +17,7 @@ from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 _AUTO_SAMPLE = 100_000  # points looked at when a voxel size is chosen: density is known well enough by then
 _MIN_POINTS = 3
 _MAX_EXTENT_RATIO = 50
+_CLOSE_COUNT = 0.01  # half a percent of the voxel size, which is rounded to two digits
 _SPACING_POINTS = 20_000
 
 
@@ -154,6 +155,8 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     size = extent / float(np.sqrt(goal))
     for _ in range(4):
         occupied = len(np.unique(voxel_keys(sample, size)))
+        if abs(occupied - goal) < _CLOSE_COUNT * goal:
+            break
         size = min(size * float(np.sqrt(occupied / goal)), extent)
     return size
 
@@ -171,7 +174,7 @@ def typical_spacing(points: FloatArray) -> float:
         away_limit = np.partition(away, _SPACING_POINTS)[_SPACING_POINTS]
         points = points[away <= away_limit]
     queries = points[:: max(1, len(points) // 2000)]
-    distances, _ = cKDTree(points).query(queries, k=2)
+    distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(queries, k=2)
     return float(np.median(np.asarray(distances)[:, 1]))
 
 
@@ -226,7 +229,9 @@ def drop_isolated(points: FloatArray, radius: float) -> FloatArray:
     from scipy.spatial import cKDTree
 
     while len(points) >= 3:
-        distances, _ = cKDTree(points).query(points, k=3)
+        # Beyond the bound nothing is sought; a tree that is not balanced is built in a third of the time.
+        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        distances, _ = tree.query(points, k=3, distance_upper_bound=np.nextafter(radius, np.inf))
         close = np.asarray(distances)[:, 2] <= radius
         if close.all():
             return points

@@ -53,14 +53,18 @@ class MatchingConfig(Section):
     neighbors: int = Field(1, ge=1, le=10, description="targets kept per source point")
     max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by method ratio")
     max_correspondences: int = Field(
-        2000, ge=3, description="at most so many are used: mutual ones first, then a seeded choice"
+        1000, ge=3, description="at most so many are used: mutual ones first, then a seeded choice"
     )
 
 
 class FilterConfig(Section):
     """What weighs the correspondences before estimation."""
 
-    name: str = Field("none", description="none, spectral (needs no training), or geomoe (the network)")
+    name: str = Field(
+        "auto",
+        description="none, spectral (needs no training), geomoe (the network), or auto: geomoe with the "
+        "shipped weights where torch is installed, else none",
+    )
     weights: str | None = Field(
         None, description="trained weights of geomoe: a .safetensors file or a shipped name"
     )
@@ -79,7 +83,7 @@ class EstimatorConfig(Section):
     one_way_weight: float = Field(
         0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"
     )
-    mutual_round: bool = Field(True, description="a second round proposes from the mutual matches alone")
+    mutual_round: bool = Field(False, description="a second round proposes from the mutual matches alone")
     ransac_iterations: int = Field(50_000, ge=1, description="most samples drawn by ransac")
     ransac_confidence: float = Field(
         0.999, gt=0, lt=1, description="ransac stops when this sure that it has drawn a clean sample"

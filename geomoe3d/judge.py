@@ -1,8 +1,8 @@
 """How sure: status, reasons and confidence from the evidence, and the information of the fit.
 
 Place: judge, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
-the clouds, its lead over the best clearly different motion, the share of correspondences that agree, and the
-overlap.
+the clouds, its lead over the best clearly different motion, the share of correspondences that agree, the
+overlap, and the verdict of the network where there is one.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from geomoe3d.config import JudgementConfig
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.result import Status
 from geomoe3d.types import FloatArray, PreparedCloud
-from geomoe3d.verification import Evidence
+from geomoe3d.verification import MOST_VERDICT, Evidence
 
 # Fitted by scripts/fit_confidence.py on 500 pairs of generated rooms and a recorded one, mixed by overlap as
 # the benchmarks are, and 250 unrelated ones; docs/measurements.md holds what came of it on real scans.
 _OFFSET = 7.14
 _SLOPES = np.array([2.68, 2.26, 1.81, -2.86])
+_OFFSET_WITH_VERDICT = 7.14
+_SLOPES_WITH_VERDICT = np.array([2.68, 2.26, 1.81, -2.86, 0.0])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
 _MOST_LEAD = 30.0
 UNRIVALLED_LEAD = 3.0
@@ -150,28 +152,35 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
     return evidence.score / other.score if other.score > 0 else float("inf")
 
 
-CONFIDENCE_INPUTS = ("log evidence", "log lead", "log support", "log overlap")
-"""What the confidence is made of, in the order of `confidence_inputs`."""
+CONFIDENCE_INPUTS = ("log evidence", "log lead", "log support", "log overlap", "verdict")
+"""What the confidence is made of, in the order of `confidence_inputs`; the last one with a network only."""
 
 
 def confidence_inputs(evidence: Evidence, lead: float, support: float) -> FloatArray:
     """(4,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
 
-    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it.
+    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. (5,) with the
+    verdict of a network, bounded, where there is one.
     """
-    return np.log(
+    logarithms = np.log(
         [
-            max(evidence.score, _LEAST_SCORE),
+            max(evidence.surface_score, _LEAST_SCORE),
             min(max(lead, 0.5), _MOST_LEAD),
             support + _LEAST_SUPPORT,
             evidence.overlap + _LEAST_OVERLAP,
         ]
     )
+    if evidence.verdict is None:
+        return logarithms
+    return np.append(logarithms, np.clip(evidence.verdict, -MOST_VERDICT, MOST_VERDICT))
 
 
 def confidence_score(evidence: Evidence, lead: float, support: float) -> float:
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
     if evidence.score <= 0:
         return 0.0
-    strength = _OFFSET + confidence_inputs(evidence, lead, support) @ _SLOPES
+    offset, slopes = _OFFSET, _SLOPES
+    if evidence.verdict is not None:
+        offset, slopes = _OFFSET_WITH_VERDICT, _SLOPES_WITH_VERDICT
+    strength = offset + confidence_inputs(evidence, lead, support) @ slopes
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

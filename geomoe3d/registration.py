@@ -28,7 +28,7 @@ from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.filters.base import Filter, FilterOutput, make_filter
+from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolve_filter
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
 from geomoe3d.threads import single_blas_thread
@@ -77,7 +77,8 @@ class Registrar:
     def __init__(
         self, config: RegistrationConfig | None = None, *, cache: DescriptionCache | None = None
     ) -> None:
-        self.config = config or RegistrationConfig()
+        config = config or RegistrationConfig()
+        self.config = config.model_copy(update={"filter": resolve_filter(config.filter)})
         self._cache = cache
         self._filter: Filter = make_filter(
             self.config.filter.name, self.config.filter.weights, self.config.estimator
@@ -210,7 +211,7 @@ class Registrar:
         clock("match")
         matched = match(*described, config.matching, seed=config.seed)
         clock("weigh")
-        if self._judge is None:
+        if self._judge is None or config.estimator.name == "svd":
             weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
         else:  # it is shown the motions that the clouds like best, later
             weighed = FilterOutput(np.ones(len(matched)))

@@ -24,7 +24,7 @@ _NUM_RANDOM = 256  # random target features per source point: p-values down to 1
 _LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
 _VIOLATION_WEIGHT = 10.0  # a tenth of the visible points in free space divides the score by e
 _VERDICT_WEIGHT = 0.5
-_MOST_VERDICT = 8.0
+MOST_VERDICT = 8.0
 _VISIBLE_FLOOR = 0.05  # fewer visible points than this share make the violation rate unreliable
 
 
@@ -60,7 +60,7 @@ class Evidence:
         """See the class; the quantity by which hypotheses are chosen."""
         if self.verdict is None:
             return self.surface_score
-        verdict = min(max(self.verdict, -_MOST_VERDICT), _MOST_VERDICT)
+        verdict = min(max(self.verdict, -MOST_VERDICT), MOST_VERDICT)
         return self.surface_score * float(np.exp(_VERDICT_WEIGHT * verdict))
 
 

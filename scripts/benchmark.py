@@ -23,7 +23,7 @@ from geomoe3d.evaluation.task import Task
 from geomoe3d.files import write_atomically
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
-ESTIMATORS = ("consensus", "spectral", "open3d-ransac-50k", "open3d-fgr", "gc-ransac")
+ESTIMATORS = ("geomoe", "geomoe-svd", "consensus", "spectral", "open3d-ransac-50k", "open3d-fgr", "gc-ransac")
 SYSTEMS = ("geomoe3d", "kiss-matcher", "open3d-feature-ransac", "icp-identity", "small-gicp")
 
 

@@ -1,23 +1,27 @@
 """Fits the confidence: P(the answer is right) as a logistic function of what the clouds say of it.
 
-    python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 200] [--out runs/confidence.jsonl]
+    python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 250] [--set filter.name=none]
+        [--out runs/confidence.jsonl]
 
-FOLDER: posed fragments that are not those of a benchmark (generated rooms, recordings of one's own). Pairs
-are drawn by overlap as the two benchmarks mix them, unrelated ones from different scenes. Every pair is
-registered with the default configuration; its outcome goes to OUT, and what is there is not done again.
-Prints coefficients for `geomoe3d/judge.py`, cross-validated over scenes. Needs scikit-learn, which the
-package itself does not.
+FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
+recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix them, unrelated ones from
+different scenes. Every pair is registered twice, without a second look and always with one, since the
+confidence decides about it; the outcomes go to OUT, and what is there is not done again. Prints
+coefficients for `geomoe3d/judge.py`, cross-validated over scenes. Needs scikit-learn, which the package
+itself does not.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from geomoe3d.config import load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
@@ -29,6 +33,8 @@ from geomoe3d.verification import Evidence
 BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 """Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""
 UNRELATED_WEIGHT = 0.5
+LOOKS = (["second_look.grids=[]"], ["judgement.min_confidence=1.0"])
+"""Settings by which a pair gets one look, and always two."""
 
 
 def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str, str, list[Any] | None]]:
@@ -54,41 +60,45 @@ def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str,
     return [chosen[k] for k in rng.permutation(len(chosen))]
 
 
-def measure(pairs: list[tuple[str, str, str, list[Any] | None]], out: Path) -> list[dict[str, Any]]:
-    """One record per pair; those in the file are kept."""
+def measure(
+    pairs: list[tuple[str, str, str, list[Any] | None]], out: Path, assignments: list[str]
+) -> list[dict[str, Any]]:
+    """One record per pair and look; those in the file are kept."""
     out.parent.mkdir(parents=True, exist_ok=True)
     lines = out.read_text().splitlines() if out.exists() else []
-    known = {(r["source"], r["target"]): r for r in map(json.loads, lines)}
-    registrar = Registrar()
+    known = {(r["source"], r["target"], r["look"]): r for r in map(json.loads, lines)}
+    registrars = [Registrar(load_config(None, [*assignments, *look])) for look in LOOKS]
     with out.open("a") as file:
         for number, (scene, source, target, T) in enumerate(pairs):
-            if (source, target) in known:
-                continue
-            result = registrar.register(load_fragment(Path(source)), load_fragment(Path(target)))
-            found = result.T_target_source
-            right = T is not None and bool(
-                np.isfinite(found).all()
-                and rotation_error_deg(found, np.array(T)) < 15
-                and translation_error(found, np.array(T)) < 0.3
-            )
-            names = ("overlap", "agreement", "distinctiveness", "free_space_violation")
-            record = {
-                "scene": scene,
-                "source": source,
-                "target": target,
-                "related": T is not None,
-                "right": right,
-                "status": result.status,
-                "lead": lead_of(result),
-                "support": result.num_inliers / max(result.num_correspondences, 1),
-                "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
-            }
-            known[(source, target)] = record
-            file.write(json.dumps(record) + "\n")
-            file.flush()
-            if number % 25 == 0:
-                print(f"{number} of {len(pairs)}", flush=True)
-    return [known[(source, target)] for _, source, target, _ in pairs]
+            for look, registrar in enumerate(registrars):
+                if (source, target, look) in known:
+                    continue
+                result = registrar.register(load_fragment(Path(source)), load_fragment(Path(target)))
+                found = result.T_target_source
+                right = T is not None and bool(
+                    np.isfinite(found).all()
+                    and rotation_error_deg(found, np.array(T)) < 15
+                    and translation_error(found, np.array(T)) < 0.3
+                )
+                names = [f.name for f in fields(Evidence) if f.name in result.evidence]
+                record = {
+                    "scene": scene,
+                    "source": source,
+                    "target": target,
+                    "look": look,
+                    "related": T is not None,
+                    "right": right,
+                    "status": result.status,
+                    "lead": lead_of(result),
+                    "support": result.num_inliers / max(result.num_correspondences, 1),
+                    "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
+                }
+                known[(source, target, look)] = record
+                file.write(json.dumps(record) + "\n")
+                file.flush()
+                if number % 25 == 0:
+                    print(f"{number} of {len(pairs)}", flush=True)
+    return [known[(source, target, look)] for _, source, target, _ in pairs for look in range(len(LOOKS))]
 
 
 def lead_of(result: RegistrationResult) -> float:
@@ -104,13 +114,14 @@ def main() -> None:
     parser.add_argument("folders", nargs="+")
     parser.add_argument("--pairs", type=int, default=500)
     parser.add_argument("--unrelated", type=int, default=200)
+    parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", default="runs/confidence.jsonl")
     given = parser.parse_args()
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import log_loss, roc_auc_score
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
-    records = measure(draw(given.folders, given.pairs, given.unrelated), Path(given.out))
+    records = measure(draw(given.folders, given.pairs, given.unrelated), Path(given.out), given.assignments)
     records = [r for r in records if r["evidence"] is not None]
     X = np.array([confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"]) for r in records])
     y = np.array([r["right"] for r in records])

@@ -76,14 +76,16 @@ def write(folder: Path, text: str, name: str = "mine.py") -> Path:
 # ---- ours on correspondences ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["geomoe3d", "consensus"])
+@pytest.mark.parametrize("name", ["geomoe3d", "geomoe", "consensus"])
 def test_ours_land_among_wrong_correspondences(name):
-    answer = make_method(name)(pair_of(correspondences(0.3)))
+    rows = correspondences(0.3)
+    answer = make_method(name)(pair_of(rows))
     assert lands(answer.T_target_source)
     assert set(answer.seconds) == {"weigh", "solve"}
     assert answer.status is None
-    assert answer.weights is None
-    assert answer.inliers is None
+    assert (answer.weights is None) == (answer.inliers is None) == (name == "consensus")
+    if answer.inliers is not None:
+        assert answer.inliers.shape == (len(rows),)
     assert all(not np.array_equal(T, answer.T_target_source) for T in answer.hypotheses)
 
 
@@ -174,7 +176,8 @@ def test_clouds_give_what_a_report_needs_in_file_coordinates(room):
     assert "total" not in answer.seconds
     rows = answer.correspondences
     assert rows is not None
-    assert answer.inliers is None
+    assert answer.inliers is not None
+    assert answer.inliers.shape == (len(rows),)
     extent = np.abs(rows[:, :3] - centre).max()
     assert extent < 10  # near the given source, not near zero
     near = np.linalg.norm(transform_points(answer.T_target_source, rows[:, :3]) - rows[:, 3:], axis=1) < 0.1
@@ -261,7 +264,7 @@ def test_network_without_torch_is_absent(weights, monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "hint"),
-    [("geomoe", "geomoe3d"), ("open3d-ransac-50K", "open3d-ransac-50k"), ("kissmatcher", "kiss-matcher")],
+    [("geomo3d", "geomoe3d"), ("open3d-ransac-50K", "open3d-ransac-50k"), ("kissmatcher", "kiss-matcher")],
 )
 def test_unknown_names_get_the_nearest(name, hint):
     with pytest.raises(InputError, match=f"did you mean '{hint}'"):

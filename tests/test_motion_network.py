@@ -320,7 +320,7 @@ def test_rows_that_are_not_finite_weigh_nothing() -> None:
 def test_proposals_take_a_second_round_from_mutual_matches() -> None:
     rows, _ = scene(4)
     mutual = np.arange(len(rows)) % 2 == 0
-    config = EstimatorConfig()
+    config = EstimatorConfig(mutual_round=True)
 
     def run(estimator: EstimatorConfig, mutual: Any) -> int:
         found = propose(

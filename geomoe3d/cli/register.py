@@ -34,7 +34,7 @@ class _Outputs:
 @click.option("--seed", metavar="N", help="Same seed, same answer. [0]")
 @click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
-@click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [none]")
+@click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [auto]")
 @click.option("--weights", metavar="FILE", help="Trained weights of the filter geomoe (.safetensors).")
 @click.option("--estimator", metavar="NAME", help="consensus, ransac or svd. [consensus]")
 @click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")

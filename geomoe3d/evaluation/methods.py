@@ -1,7 +1,8 @@
 """Methods by name: ours on correspondences and clouds, other people's, and a user's own function.
 
-``geomoe3d`` is the whole product with any configuration; ``consensus`` and ``svd`` are parts of it with a
-fixed one, to compare against. Peers are in `peers`, functions of the user in `adapter`. The
+``geomoe3d`` is the whole product with any configuration; ``geomoe`` (the shipped network on what consensus
+proposes), ``geomoe-svd`` (weighted least squares on its weights alone), ``consensus`` and ``svd`` are parts
+of it with a fixed one, to compare against. Peers are in `peers`, functions of the user in `adapter`. The
 identity of ours holds the hash of the source that decides answers: a cache never mixes two versions of it.
 """
 
@@ -26,7 +27,7 @@ from geomoe3d.evaluation.adapter import AdaptedFunction
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
 from geomoe3d.evaluation.records import Answer, Method, MethodInput
-from geomoe3d.filters.base import Filter, FilterOutput, make_filter
+from geomoe3d.filters.base import DEFAULT_WEIGHTS, Filter, FilterOutput, make_filter, resolve_filter
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.stages import StageClock
 from geomoe3d.types import BoolArray, Correspondences, FloatArray
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 OURS: dict[str, tuple[str, ...]] = {
     "geomoe3d": (),
+    "geomoe": ("filter.name=geomoe", "estimator.name=consensus"),
+    "geomoe-svd": ("filter.name=geomoe", "estimator.name=svd"),
     "consensus": ("filter.name=none", "estimator.name=consensus"),
     "svd": ("filter.name=none", "estimator.name=svd"),
 }
@@ -114,7 +117,8 @@ class OurMethod:
         keys = {assignment.partition("=")[0].strip() for assignment in assignments}
         if "seed" in keys:
             raise ConfigError("'seed' is that of the evaluation for all methods; leave it out of the values")
-        self.config: RegistrationConfig = load_config(None, [*OURS[name], *assignments])
+        config = load_config(None, [*OURS[name], *assignments])
+        self.config: RegistrationConfig = config.model_copy(update={"filter": resolve_filter(config.filter)})
         self._own_threshold = "estimator.inlier_threshold" in keys
         self._registrar: Registrar | None = None
         self._filter: Filter | None = None
@@ -219,7 +223,6 @@ class OurMethod:
     def _weights_hash(self) -> str | None:
         if self.config.filter.name != "geomoe" or self.absent() is not None:
             return None
-        from geomoe3d.filters.geomoe_filter import DEFAULT_WEIGHTS
         from geomoe3d.filters.pretrained import find_weights
 
         path = find_weights(self.config.filter.weights or DEFAULT_WEIGHTS)

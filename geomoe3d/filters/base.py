@@ -7,13 +7,15 @@ weigh, between match and solve. New filters join by a line in `_FACTORIES`; the 
 from __future__ import annotations
 
 import difflib
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from geomoe3d.config import EstimatorConfig
+from geomoe3d.config import EstimatorConfig, FilterConfig
 from geomoe3d.errors import ConfigError, DependencyError
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
 
@@ -84,6 +86,9 @@ def _geomoe(weights: str | None, estimator: EstimatorConfig) -> Filter:
     return geomoe_filter(weights, estimator)
 
 
+DEFAULT_WEIGHTS = "geomoe3d"
+"""Name of the weights that ship with the package."""
+
 _FACTORIES: dict[str, Callable[[str | None, EstimatorConfig], Filter]] = {
     "none": _none,
     "spectral": _spectral,
@@ -96,11 +101,24 @@ def filter_names() -> list[str]:
     return list(_FACTORIES)
 
 
+def resolve_filter(config: FilterConfig) -> FilterConfig:
+    """What ``auto`` means on this machine; any other name as it is.
+
+    The network is taken where its libraries are installed and weights are given or ship with the package.
+    """
+    if config.name != "auto":
+        return config
+    installed = all(importlib.util.find_spec(name) is not None for name in ("torch", "safetensors"))
+    shipped = (Path(__file__).parent / "weights" / f"{DEFAULT_WEIGHTS}.safetensors").is_file()
+    usable = installed and (config.weights is not None or shipped)
+    return config.model_copy(update={"name": "geomoe" if usable else "none"})
+
+
 def make_filter(name: str, weights: str | None = None, estimator: EstimatorConfig | None = None) -> Filter:
     """The filter of a given name.
 
     Args:
-        name: one of `filter_names`.
+        name: one of `filter_names`; ``auto`` is resolved by `resolve_filter` before.
         weights: file or name of trained weights, for filters that have any; None takes the shipped ones.
         estimator: what proposes motions to filters that judge some; None takes the defaults.
 

@@ -22,6 +22,7 @@ from geomoe3d.filters.folded import FoldedGeoMoE
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.geomoe_filter import Insight, finite_rows, run
 from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, motion_inputs
+from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.types import Correspondences, FloatArray
 
@@ -106,7 +107,8 @@ class MotionJudge:
         views = part.viewpoints or (None, None)
         found = []
         for inputs in motion_inputs(part.points, motions, views, voxel_size, self.config):
-            out = run(self._network, inputs, self.device)
+            with single_torch_thread():
+                out = run(self._network, inputs, self.device)
             assert out.verdict is not None
             insight = Insight.blind(len(correspondences), self.config.num_layers)
             insight.fill(seen, out)
@@ -129,7 +131,7 @@ class MotionJudge:
             part,
             np.ones(len(part)),
             self._proposing,
-            inlier_threshold=self.config.compatibility_threshold * voxel_size,
+            inlier_threshold=self._proposing.inlier_threshold * voxel_size,
             seed=seed,
         )
         if not found:

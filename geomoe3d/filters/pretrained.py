@@ -49,21 +49,24 @@ class WeightCard:
     notes: str = ""
 
 
-def save_pretrained(path: str | Path, model: GeoMoE, card: WeightCard, *, force: bool = False) -> WeightCard:
+def save_pretrained(
+    path: str | Path, model: GeoMoE, card: WeightCard, *, force: bool = False, half: bool = False
+) -> WeightCard:
     """Write ``path`` (.safetensors) and its card (.json beside it).
 
     Args:
         path: ending in .safetensors.
-        model: whose parameters and buffers are written, as float32 on the CPU.
+        model: whose parameters and buffers are written.
         card: architecture and hash are filled in here.
         force: replace existing files.
+        half: in half precision, for shipping; else as float32.
 
     Returns:
         The card as written.
 
     Raises:
         OutputError: a file exists and ``force`` is False, or it cannot be written.
-        CheckpointError: another suffix.
+        CheckpointError: another suffix, or numbers beyond the range of half precision.
     """
     from safetensors.torch import save
 
@@ -71,6 +74,11 @@ def save_pretrained(path: str | Path, model: GeoMoE, card: WeightCard, *, force:
     if path.suffix != ".safetensors":
         raise CheckpointError(f"weights are written as .safetensors, not '{path.name}'")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    if half:
+        tensors = {name: t.half() if t.is_floating_point() else t for name, t in tensors.items()}
+        lost = [name for name, t in tensors.items() if not bool(t.isfinite().all())]
+        if lost:
+            raise CheckpointError(f"'{lost[0]}' does not fit half precision; save in single precision")
     data = save(tensors)
     write_atomically(path, lambda temporary: _write(temporary, data), force=force)
     values = asdict(card)

@@ -1,0 +1,63 @@
+"""Turn the best weights of a training run into those that ship with the package, in half precision.
+
+    python scripts/ship_weights.py runs/motions
+
+Reads best.pt and config.yaml of the run folder and writes geomoe3d/filters/weights/geomoe3d.safetensors and
+its card. Says how far the network's verdicts move by the rounding.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from geomoe3d.filters.base import DEFAULT_WEIGHTS
+from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.pretrained import PACKAGED, WeightCard, load_pretrained, save_pretrained
+from geomoe3d.provenance import source_commit
+from geomoe3d.training.checkpoint import load_checkpoint
+from geomoe3d.training.config import load_train_config
+
+NOTES = (
+    "GeoMoE that judges motions; see geomoe3d/filters/weights/MODEL_CARD.md. Trained on generated rooms, walks "
+    "through scene meshes (MIT-0) and one recorded lounge; never on 3DMatch or 3DLoMatch."
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path, help="run folder of geomoe3d train")
+    run = parser.parse_args().run
+    state = load_checkpoint(run / "best.pt")
+    model = GeoMoE(load_train_config(str(run / "config.yaml")).network)
+    model.load_state_dict(state["model"])
+    card = WeightCard(
+        architecture={},
+        voxel_size=(0.05, 0.05),
+        training_data=str(state.get("data", "")),
+        steps=int(state["step"]),
+        metrics=state["metrics"],
+        commit=source_commit(),
+        notes=NOTES,
+    )
+    PACKAGED.mkdir(exist_ok=True)
+    path = PACKAGED / f"{DEFAULT_WEIGHTS}.safetensors"
+    save_pretrained(path, model, card, force=True, half=True)
+    print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, step {card.steps}, {card.metrics}")
+    print(f"verdicts move by up to {_moved(model.eval(), load_pretrained(path)[0]):.4f}")
+
+
+@torch.no_grad()
+def _moved(model: GeoMoE, rounded: GeoMoE) -> float:
+    """Largest change of a verdict on made-up channels."""
+    torch.manual_seed(0)
+    channels = torch.rand(16, 500, model.config.num_extra_channels) ** 3
+    coordinates = torch.rand(16, 500, 6)
+    first, second = (net(coordinates, channels).verdict for net in (model, rounded))
+    return float((first - second).abs().max())
+
+
+if __name__ == "__main__":
+    main()

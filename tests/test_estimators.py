@@ -526,8 +526,8 @@ def test_twelve_thousand_correspondences_stay_within_bounds(monkeypatch: pytest.
     rows, T, true = problem(14, count=12_000, inliers=0.02, noise=0.005)
     weights = np.where(true, 1.0, 0.5)
     sizes = []
-    plain = consensus.pairwise_distances
-    monkeypatch.setattr(consensus, "pairwise_distances", lambda p: (sizes.append(len(p)), plain(p))[1])
+    plain = consensus.distances
+    monkeypatch.setattr(consensus, "distances", lambda p, q: (sizes.append(len(p)), plain(p, q))[1])
     tracemalloc.start()
     found = ConsensusEstimator(max_dense=1000, num_seeds=100)(rows, weights, inlier_threshold=THRESHOLD)
     peak = tracemalloc.get_traced_memory()[1]
@@ -549,7 +549,7 @@ def test_default_bound_of_all_pairs() -> None:
 def test_distances_and_compatibility_equal_their_definitions() -> None:
     rng = np.random.default_rng(80)
     p, q = rng.normal(size=(2, 60, 3)).astype(np.float32) * 20
-    np.testing.assert_allclose(consensus.pairwise_distances(p), cdist(p, p), atol=0.05)
+    np.testing.assert_allclose(consensus.distances(p, p), cdist(p, p), atol=0.05)
     q[:30] = p[:30]
     expected = np.abs(cdist(p, p) - cdist(q, q))
     compatible = consensus.compatibility(cdist(p, p).astype(np.float32), cdist(q, q).astype(np.float32))

@@ -103,8 +103,8 @@ class ConsensusEstimator:
     ) -> tuple[Floats, Floats]:
         """One motion per seed from its local set: R (M, 3, 3), t (M, 3)."""
         p, q, v = source[rows], target[rows], vote[rows]
-        source_distance = pairwise_distances(p)
-        compatible = compatibility(source_distance, pairwise_distances(q))
+        source_distance = distances(p, p)
+        compatible = compatibility(source_distance, distances(q, q))
         support = compatible @ v
         seeds = choose_seeds(support, source_distance, self.num_seeds)
         witnesses = np.sort(choose_seeds(support, source_distance, self.num_witnesses))
@@ -164,16 +164,15 @@ def bundle_weights(target: FloatArray) -> Float32Array:
     return weights
 
 
-def pairwise_distances(points: Float32Array) -> Float32Array:
-    """(N, N) Euclidean distances of centred points (N, 3) through one matrix product."""
-    squares = (points * points).sum(1, keepdims=True)
-    ones = np.ones_like(squares)
-    # [-2p, |p|^2, 1] . [q, 1, |q|^2] = |p - q|^2 without a further pass over N x N numbers.
-    left, right = np.hstack([-2 * points, squares, ones]), np.hstack([points, ones, squares])
-    distances: Float32Array = left @ right.T
-    np.maximum(distances, 0, out=distances)
-    np.sqrt(distances, out=distances)
-    return distances
+def distances(a: Float32Array, b: Float32Array) -> Float32Array:
+    """(N, M) Euclidean distances of points (N, 3) and (M, 3), near zero, through one matrix product."""
+    a2, b2 = (a * a).sum(1, keepdims=True), (b * b).sum(1, keepdims=True)
+    # [-2a, |a|^2, 1] . [b, 1, |b|^2] = |a - b|^2 without a further pass over N x M numbers.
+    left, right = np.hstack([-2 * a, a2, np.ones_like(a2)]), np.hstack([b, np.ones_like(b2), b2])
+    found: Float32Array = left @ right.T
+    np.maximum(found, 0, out=found)
+    np.sqrt(found, out=found)
+    return found
 
 
 def compatibility(source_distance: Float32Array, target_distance: Float32Array) -> Float32Array:

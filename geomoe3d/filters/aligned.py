@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.clouds.range_image import RangeImage
-from geomoe3d.estimators.consensus import bundle_weights
+from geomoe3d.estimators.consensus import bundle_weights, distances
 from geomoe3d.types import Float32Array, FloatArray, IntArray
 
 CHANNELS = (
@@ -153,19 +153,13 @@ class AlignedChannels:
 
 def _degree(rows: FloatArray) -> Float32Array:
     """(N,) 5 x the share of at most 1,000 of the correspondences with which each one preserves length."""
-    anchors = rows[:: -(-len(rows) // _MOST_ANCHORS)]
-    gap = _distances(rows[:, :3], anchors[:, :3])
-    gap -= _distances(rows[:, 3:], anchors[:, 3:])
+    unit = (rows - rows.mean(0)).astype(np.float32)
+    anchors = unit[:: -(-len(unit) // _MOST_ANCHORS)]
+    gap = distances(unit[:, :3], anchors[:, :3])
+    gap -= distances(unit[:, 3:], anchors[:, 3:])
     compatible = np.abs(gap, out=gap) < 1.0
     share: Float32Array = (5 * (compatible.sum(1) - 1) / len(anchors)).astype(np.float32)
     return share
-
-
-def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
-    from scipy.spatial.distance import cdist
-
-    found: FloatArray = cdist(a, b)
-    return found
 
 
 def _kernel(square: FloatArray) -> FloatArray:

@@ -79,7 +79,7 @@ class EstimatorConfig(Section):
         "fit, for correspondences that are nearly all right",
     )
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
-    num_hypotheses: int = Field(15, ge=1, description="distinct hypotheses that consensus keeps by round")
+    num_hypotheses: int = Field(20, ge=1, description="distinct hypotheses that consensus keeps by round")
     one_way_weight: float = Field(
         0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"
     )

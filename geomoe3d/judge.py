@@ -7,7 +7,7 @@ overlap, and the verdict of the network where there is one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -121,10 +121,9 @@ def judge(
             "plain, like a single plane or cylinder"
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
-    if (
-        lead < 1 / config.ambiguity_ratio
-        and confidence_score(evidence, UNRIVALLED_LEAD, support) >= config.min_confidence
-    ):
+    # Without a rival it would do, by the clouds alone: the network doubts what it has seen no like of.
+    alone = confidence_score(replace(evidence, verdict=None), UNRIVALLED_LEAD, support)
+    if lead < 1 / config.ambiguity_ratio and alone >= config.min_confidence:
         notes.append(
             f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "
             "the scans may show repeated or symmetric structure"

@@ -21,7 +21,7 @@ from geomoe3d.training.checkpoint import load_checkpoint
 from geomoe3d.training.config import load_train_config
 
 NOTES = (
-    "GeoMoE that judges motions; see geomoe3d/filters/weights/MODEL_CARD.md. Trained on generated rooms, walks "
+    "GeoMoE that judges motions; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
     "through scene meshes (MIT-0) and one recorded lounge; never on 3DMatch or 3DLoMatch."
 )
 

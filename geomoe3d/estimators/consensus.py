@@ -2,7 +2,7 @@
 
 A rigid motion preserves lengths, so two true correspondences i, j satisfy |p_i - p_j| = |q_i - q_j| up to
 noise. The steps, each one function below: *compatibility* of all pairs; *seeds*, the best supported
-correspondences spread over the scene; for each seed the *local set* of correspondences that share most
+correspondences spread over the scene; for each seed the *local sets* of correspondences that share most
 compatible partners with it (second-order compatibility, Chen et al., SC2-PCR, CVPR 2022); one weighted
 Kabsch per set; a *score* over all correspondences; reweighted *refinement* of the best distinct motions.
 
@@ -36,8 +36,10 @@ class ConsensusEstimator:
     Attributes:
         num_hypotheses: distinct motions returned at most.
         num_seeds: correspondences whose local set proposes a motion.
-        set_size: correspondences in a local set besides the seed. Few: where inliers are rare, a larger set
-            takes in wrong ones.
+        set_sizes: correspondences in the local sets of a seed besides itself, rising. Small sets, because
+            larger ones take in wrong correspondences where inliers are rare; more than one, because they err
+            on different pairs.
+        length_tolerance: difference of lengths that is compatible, in inlier thresholds.
         num_witnesses: best supported correspondences among which common partners are counted.
         num_refined: distinct proposals that are refined.
         num_refits: rounds of reweighted refinement.
@@ -49,7 +51,8 @@ class ConsensusEstimator:
 
     num_hypotheses: int = 8
     num_seeds: int = 1000
-    set_size: int = 4
+    set_sizes: tuple[int, ...] = (3, 6)
+    length_tolerance: float = 0.8
     num_witnesses: int = 300
     num_refined: int = 20
     num_refits: int = 6
@@ -101,15 +104,20 @@ class ConsensusEstimator:
     def _propose(
         self, source: Float32Array, target: Float32Array, vote: Float32Array, rows: IntArray
     ) -> tuple[Floats, Floats]:
-        """One motion per seed from its local set: R (M, 3, 3), t (M, 3)."""
+        """One motion per seed and size of its local set: R (S M, 3, 3), t (S M, 3)."""
         p, q, v = source[rows], target[rows], vote[rows]
         source_distance = distances(p, p)
-        compatible = compatibility(source_distance, distances(q, q))
+        compatible = compatibility(source_distance, distances(q, q), self.length_tolerance)
         support = compatible @ v
         seeds = choose_seeds(support, source_distance, self.num_seeds)
         witnesses = np.sort(choose_seeds(support, source_distance, self.num_witnesses))
-        members, member_weights = local_sets(compatible, seeds, v, self.set_size, witnesses)
-        return fit_rigid(p[members], q[members], member_weights)
+        members, weights = local_sets(compatible, seeds, v, max(self.set_sizes), witnesses)
+        fits = [
+            fit_rigid(p[some], q[some], weights[:, : size + 1])
+            for size in self.set_sizes
+            for some in (members[:, : size + 1],)
+        ]
+        return np.concatenate([R for R, _ in fits]), np.concatenate([t for _, t in fits])
 
     def _keep_distinct(self, R: Floats, t: Floats, scores: Floats, limit: int) -> tuple[Floats, Floats]:
         keep = self._distinct_rows(R, t, scores, limit)
@@ -175,14 +183,16 @@ def distances(a: Float32Array, b: Float32Array) -> Float32Array:
     return found
 
 
-def compatibility(source_distance: Float32Array, target_distance: Float32Array) -> Float32Array:
-    """1 where two correspondences preserve length to one inlier threshold, else 0; zero diagonal.
+def compatibility(
+    source_distance: Float32Array, target_distance: Float32Array, tolerance: float = 1.0
+) -> Float32Array:
+    """1 where two correspondences preserve length to within ``tolerance``, else 0; zero diagonal.
 
-    Both arguments (N, N) in units of the threshold; ``target_distance`` is overwritten.
+    Both distances (N, N) in inlier thresholds, as the tolerance; ``target_distance`` is overwritten.
     """
     target_distance -= source_distance
     np.abs(target_distance, out=target_distance)
-    compatible = (target_distance < 1.0).astype(np.float32)
+    compatible = (target_distance < tolerance).astype(np.float32)
     np.fill_diagonal(compatible, 0)
     return compatible
 

@@ -26,7 +26,7 @@ from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.types import Correspondences, FloatArray
 
-MOST_MOTIONS = 16
+MOST_MOTIONS = 20
 """Motions that the filter judges of those that consensus proposes."""
 MOST_ROWS = 1000
 """Correspondences that a motion is judged on; mutual ones first where there are more."""

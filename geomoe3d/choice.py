@@ -100,10 +100,10 @@ class Chooser:
         if answer is None:
             return Findings.nothing("no motion brings three correspondences in general position together")
         T, (source, target) = answer.T_target_source, self._described
-        other, lead = self._rival(answer)
+        other, lead, rival = self._rival(answer)
         information = measure_information(T, source, target, self._threshold)
         support = self._support(T)
-        judgement = judge(answer.evidence, lead, support, information, self._config.judgement)
+        judgement = judge(answer.evidence, lead, support, information, self._config.judgement, rival)
         findings = Findings(T, other, lead, answer.evidence, information, judgement, self._weights_under(T))
         return findings if answer.note is None else findings.with_note(answer.note)
 
@@ -155,8 +155,8 @@ class Chooser:
             return Refined(T_target_source, before, note)
         return Refined(T, after, note)
 
-    def _rival(self, answer: Refined) -> tuple[Hypothesis | None, float]:
-        """The best clearly different motion, and the answer's lead over it."""
+    def _rival(self, answer: Refined) -> tuple[Hypothesis | None, float, Evidence | None]:
+        """The best clearly different motion, the answer's lead over it, and its evidence."""
         T, source = answer.T_target_source, self._described[0]
         other = clearly_different(self._ranked, T, source, self._shift)
         lead = lead_over(answer.evidence, other[1] if other else None)
@@ -166,7 +166,7 @@ class Chooser:
                 moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
                 other = clearly_different([moved], T, source, self._shift) or other
                 lead = lead_over(answer.evidence, other[1])
-        return (other[0] if other else None), lead
+        return (other[0], lead, other[1]) if other else (None, lead, None)
 
     def _support(self, T_target_source: FloatArray) -> float:
         """Share of the correspondences that agree with a motion."""

@@ -26,6 +26,7 @@ _SLOPES_WITH_VERDICT = np.array([2.68, 2.26, 1.81, -2.86, 0.0])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
 _MOST_LEAD = 30.0
 UNRIVALLED_LEAD = 3.0
+_CLOSE_VERDICTS = 2.0  # odds of seven to one
 _LEAST_OBSERVABILITY = 0.005
 _LOW_OVERLAP = 0.1
 
@@ -91,6 +92,7 @@ def judge(
     support: float,
     information: Information,
     config: JudgementConfig,
+    rival: Evidence | None = None,
 ) -> Judgement:
     """Decide whether an answer may be believed.
 
@@ -100,6 +102,7 @@ def judge(
         support: share of the correspondences that agree with the answer.
         information: of the answer.
         config: thresholds.
+        rival: of the best clearly different motion, if there is one.
 
     Returns:
         ``ambiguous`` where the surfaces let the source slide, or where the evidence would do but another
@@ -123,9 +126,10 @@ def judge(
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     # Without a rival it would do, by the clouds alone: the network doubts what it has seen no like of.
     alone = confidence_score(replace(evidence, verdict=None), UNRIVALLED_LEAD, support)
-    if lead < 1 / config.ambiguity_ratio and alone >= config.min_confidence:
+    close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(evidence, rival, config.ambiguity_ratio)
+    if close and alone >= config.min_confidence:
         notes.append(
-            f"a clearly different motion fits {min(100 / lead, 100):.0f} % as well; see the alternative, "
+            f"a clearly different motion does {min(100 / lead, 100):.0f} % as well; see the alternative, "
             "the scans may show repeated or symmetric structure"
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.5))
@@ -136,6 +140,14 @@ def judge(
         )
         return Judgement("low_confidence", tuple(notes), confidence)
     return Judgement("ok", tuple(notes), confidence)
+
+
+def _hardly_told_apart(evidence: Evidence, rival: Evidence | None, ratio: float) -> bool:
+    """Whether the clouds like both about as well and the network's verdicts lie close together."""
+    if rival is None or evidence.verdict is None or rival.verdict is None:
+        return False
+    alike = rival.surface_score >= ratio * evidence.surface_score
+    return alike and abs(evidence.verdict - rival.verdict) < _CLOSE_VERDICTS
 
 
 def lead_over(evidence: Evidence, other: Evidence | None) -> float:

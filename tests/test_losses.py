@@ -174,3 +174,18 @@ def test_network_motion_carries_the_inliers() -> None:
     inlier = coordinates[0][labels[0]].double()
     moved = inlier[:, :3] @ truth[0, :3, :3].T + truth[0, :3, 3]
     torch.testing.assert_close(moved, inlier[:, 3:], atol=1e-5, rtol=0)
+
+
+def test_plain_classification_weighs_rows_and_puts_its_zero_where_the_weight_says() -> None:
+    logits = torch.tensor([[[0.5, -1.0, 2.0, 0.0]]])
+    labels = torch.tensor([[True, False, False, False]])
+    mask = torch.tensor([[True, True, True, False]])
+    rows = [3 * np.log1p(np.exp(-0.5)), np.log1p(np.exp(-1.0)), np.log1p(np.exp(2.0))]
+    loss = classification_loss(logits, labels, mask, "plain", 3.0)
+    assert loss.shape == (1,)
+    assert float(loss) == pytest.approx(np.mean(rows), abs=1e-6)
+    # A quarter of equal rows are inliers: with a weight of 3 the best logit is 0.
+    z = torch.zeros(1, 1, 4, requires_grad=True)
+    classification_loss(z, labels, None, "plain", 3.0).sum().backward()
+    assert z.grad is not None
+    assert float(z.grad.sum()) == pytest.approx(0, abs=1e-6)

@@ -37,7 +37,12 @@ class LossConfig(Section):
     virtual_points: int = Field(4, ge=2, description="per edge of the lattice in the source's box")
     balance_weight: float = Field(0.01, ge=0)
     classification_form: Literal["balanced", "plain"] = Field(
-        "balanced", description="inliers and outliers weigh half each, as published, or every row alike"
+        "balanced", description="inliers and outliers weigh half each, as published, or by inlier_weight"
+    )
+    inlier_weight: float = Field(
+        1.0,
+        gt=0,
+        description="of an inlier beside an outlier in the plain form; a logit is 0 at odds of 1 to it",
     )
     verdict_weight: float = Field(1.0, ge=0, description="of the verdict, for networks that judge motions")
 
@@ -93,7 +98,11 @@ def verdict_loss(verdict: Tensor, right: Tensor, pair: Tensor) -> Tensor:
 
 
 def classification_loss(
-    logits: Tensor, labels: Tensor, mask: Tensor | None = None, form: str = "balanced"
+    logits: Tensor,
+    labels: Tensor,
+    mask: Tensor | None = None,
+    form: str = "balanced",
+    inlier_weight: float = 1.0,
 ) -> Tensor:
     """Binary cross-entropy per pair: half for its inliers and half for its outliers, or plain.
 
@@ -101,8 +110,8 @@ def classification_loss(
         logits: (..., B, N).
         labels: (B, N) bool, True for inliers.
         mask: (B, N) bool, False at padding, or None.
-        form: ``balanced``, or ``plain``: the mean over rows, for which a logit is 0 at a probability of one
-            half.
+        form: ``balanced``, or ``plain``: the mean over rows.
+        inlier_weight: w of an inlier in the plain form; a logit is then 0 at a probability of 1 / (1 + w).
 
     Returns:
         (...) mean over pairs. A side without members contributes 0.
@@ -112,7 +121,12 @@ def classification_loss(
     """
     logits = logits.float()
     if form == "plain":
-        cost = F.binary_cross_entropy_with_logits(logits, labels.float().expand_as(logits), reduction="none")
+        cost = F.binary_cross_entropy_with_logits(
+            logits,
+            labels.float().expand_as(logits),
+            reduction="none",
+            pos_weight=logits.new_tensor(inlier_weight),
+        )
         return cost.mean(-1).mean(-1) if mask is None else ((cost * mask).sum(-1) / mask.sum(-1)).mean(-1)
     positive = labels if mask is None else labels & mask
     negative = ~labels if mask is None else ~labels & mask
@@ -199,7 +213,9 @@ def total_loss(
     pair: Tensor | None = None,
 ) -> Losses:
     """All terms at ``progress`` (0 to 1) of the schedule; before the warm-up ends no motion is solved."""
-    classification = classification_loss(output.logits, labels, mask, config.classification_form).sum()
+    classification = classification_loss(
+        output.logits, labels, mask, config.classification_form, config.inlier_weight
+    ).sum()
     regression = classification.new_zeros(())
     unsolved = torch.zeros((), dtype=torch.int64, device=classification.device)
     if config.regression_weight > 0 and progress >= config.regression_warmup:

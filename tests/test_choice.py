@@ -15,6 +15,8 @@ from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import ConfigError, EmptyCloudError
+from geomoe3d.filters.base import FilterOutput
+from geomoe3d.filters.motion_judge import Judged
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg
 from geomoe3d.registration import Registrar
 from geomoe3d.stages import StageClock
@@ -66,6 +68,64 @@ def test_without_verification_the_first_of_the_first_lot_is_the_answer(pair):
     asked.consider([off(pair[1], 90, 1.0), off(pair[1], 0, 0.0)])
     asked.consider([off(pair[1], 0, 0.0)])
     assert rotation_error_deg(asked.conclude().T_target_source, pair[1]) == pytest.approx(90)
+
+
+def opinions(*liked: np.ndarray):
+    """A network that believes in the given motions and in no other; and what it was shown."""
+    shown = []
+
+    def network(motions):
+        shown.extend(motions)
+        return [
+            Judged(
+                6.0 if any(np.array_equal(m, l) for l in liked) else -6.0, FilterOutput(np.full(3, k + 1.0))
+            )
+            for k, m in enumerate(motions)
+        ]
+
+    return network, shown
+
+
+def with_network(pair, network, *assignments: str) -> Chooser:
+    config = load_config(None, list(assignments))
+    return Chooser(pair[0], match(*pair[0], config.matching), 2 * VOXEL, config, StageClock(), network)
+
+
+def test_a_network_turns_the_choice_where_the_clouds_waver(pair):
+    right, near = off(pair[1], 0.5, 0.01), off(pair[1], 20, 0.0)
+    plain = chooser(pair, "refinement.method=none")
+    plain.consider([right, near])
+    assert rotation_error_deg(plain.conclude().T_target_source, pair[1]) < 1
+    network, shown = opinions(near.T_target_source)
+    asked = with_network(pair, network, "refinement.method=none")
+    asked.consider([right, near])
+    findings = asked.conclude()
+    assert len(shown) == 2
+    assert rotation_error_deg(findings.T_target_source, pair[1]) == pytest.approx(20, abs=0.1)
+    assert findings.evidence.verdict == 6.0
+    assert findings.weighed is not None
+    np.testing.assert_array_equal(findings.weighed.weights, [2.0, 2.0, 2.0])
+
+
+def test_a_network_is_shown_a_few_distinct_motions_once(pair):
+    motions = [off(pair[1], angle, 0.0) for angle in (0, 1, 40, 80, 120, 160)]
+    network, shown = opinions(motions[0].T_target_source)
+    asked = with_network(pair, network)
+    asked.consider(motions)
+    asked.conclude(1, 2)
+    assert len(shown) == 2
+    findings = asked.conclude(3, 4)
+    assert len(shown) == 4
+    assert len({m.tobytes() for m in shown}) == 4
+    assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
+
+
+def test_without_verification_no_network_is_asked(pair):
+    network, shown = opinions()
+    asked = with_network(pair, network, "verification.enabled=false")
+    asked.consider([off(pair[1], 0, 0.0)])
+    assert asked.conclude().evidence.verdict is None
+    assert not shown
 
 
 def test_nothing_considered_is_a_failure_and_not_identity(pair):

@@ -364,7 +364,7 @@ def test_a_scene_that_stands_twice_in_the_target_is_ambiguous() -> None:
     assert other is not None
     assert rotation_error_deg(other.T_target_source, places[1 - int(np.argmin(errors))]) < 5
     assert other.rotation_difference_deg > 175
-    assert other.relative_score > 0.8
+    assert other.relative_score > 0.2  # the clouds like both alike; a network may prefer one
 
 
 # ---- findings and the clock ------------------------------------------------------------------------------

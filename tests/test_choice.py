@@ -78,7 +78,7 @@ def opinions(*liked: np.ndarray):
         shown.extend(motions)
         return [
             Judged(
-                6.0 if any(np.array_equal(m, l) for l in liked) else -6.0, FilterOutput(np.full(3, k + 1.0))
+                6.0 if any(np.array_equal(m, x) for x in liked) else -6.0, FilterOutput(np.full(3, k + 1.0))
             )
             for k, m in enumerate(motions)
         ]

@@ -83,6 +83,8 @@ class Registrar:
         self._filter: Filter = make_filter(
             self.config.filter.name, self.config.filter.weights, self.config.estimator
         )
+        network = getattr(self._filter, "config", None)
+        self._wants_ratio = "ratio" in getattr(network, "extra_channels", ())
         self._judge: MotionJudge | None = getattr(self._filter, "as_judge", None)
         self._estimator: Estimator = make_estimator(self.config.estimator)
 
@@ -209,7 +211,7 @@ class Registrar:
         """Match, weigh and solve."""
         config, voxel_size = self.config, described[0].voxel_size
         clock("match")
-        matched = match(*described, config.matching, seed=config.seed)
+        matched = match(*described, config.matching, seed=config.seed, with_ratio=self._wants_ratio)
         clock("weigh")
         if self._judge is None or config.estimator.name == "svd":
             weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)

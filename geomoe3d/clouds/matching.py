@@ -27,7 +27,12 @@ _SMALL_ENTRIES = 100_000_000  # up to 10,000 against 10,000 points one thread is
 
 
 def match(
-    source: PreparedCloud, target: PreparedCloud, config: MatchingConfig, *, seed: int = 0
+    source: PreparedCloud,
+    target: PreparedCloud,
+    config: MatchingConfig,
+    *,
+    seed: int = 0,
+    with_ratio: bool = True,
 ) -> Correspondences:
     """Putative correspondences between two described clouds.
 
@@ -37,6 +42,13 @@ def match(
     seeded random choice of the others. (The most distinctive by ratio crowd on a few objects and fix the
     motion less well than random ones do.)
 
+    Args:
+        source: described cloud.
+        target: described cloud.
+        config: see above.
+        seed: decides what is kept beyond the limit.
+        with_ratio: False leaves the ratio out, a quarter of the time, unless the method needs it.
+
     Raises:
         InputError: a cloud without features.
     """
@@ -44,20 +56,23 @@ def match(
         raise InputError("match needs described clouds; call describe(cloud, config) on both first")
     small = len(source) * len(target) <= _SMALL_ENTRIES
     with single_blas_thread() if small else nullcontext():
-        index, distance, ratio, mutual = nearest_features(source.features, target.features, config.neighbors)
+        index, distance, ratio, mutual = nearest_features(
+            source.features, target.features, config.neighbors, with_ratio or config.method == "ratio"
+        )
     rows = np.repeat(np.arange(len(source)), index.shape[1])
     columns, mutual = index.ravel(), mutual.ravel()
     keep: BoolArray = np.ones(len(rows), dtype=np.bool_)
     if config.method == "mutual":
         keep = mutual
     elif config.method == "ratio":
+        assert ratio is not None
         keep = ratio.ravel() <= config.max_ratio
     found = Correspondences(
         np.hstack([source.points[rows], target.points[columns]]),
         rows,
         columns,
         distance.ravel(),
-        ratio.ravel(),
+        None if ratio is None else ratio.ravel(),
         mutual,
         _viewpoints(source, target),
     ).take(keep)
@@ -75,14 +90,15 @@ def _viewpoints(source: PreparedCloud, target: PreparedCloud) -> tuple[FloatArra
 
 
 def nearest_features(
-    source: Float32Array, target: Float32Array, neighbors: int
-) -> tuple[IntArray, Float32Array, Float32Array, BoolArray]:
+    source: Float32Array, target: Float32Array, neighbors: int, with_ratio: bool = True
+) -> tuple[IntArray, Float32Array, Float32Array | None, BoolArray]:
     """The nearest target features of each source feature, and whether the choice is mutual.
 
     Args:
         source: (n, d) unit features.
         target: (m, d) unit features.
         neighbors: targets k per source feature; fewer where m is smaller.
+        with_ratio: False leaves out the ratio, None then.
 
     Returns:
         Index (n, k) of the nearest targets, best first; their Euclidean distance (n, k); the ratio (n, k)
@@ -105,14 +121,17 @@ def nearest_features(
             choice = similarity.argmax(1)
             index[start:stop, rank] = choice
             best[start:stop, rank] = similarity[rows, choice]
-            similarity[rows, choice] = -np.inf
-        if k < len(target):
+            if rank + 1 < k or with_ratio:
+                similarity[rows, choice] = -np.inf
+        if k < len(target) and with_ratio:
             beyond[start:stop] = similarity.max(1)
     distance = np.sqrt(np.maximum(2 - 2 * best, 0))
-    next_distance = np.sqrt(np.maximum(2 - 2 * np.where(np.isfinite(beyond), beyond, 1), 0))[:, None]
-    usable = np.isfinite(beyond)[:, None] & (next_distance > 0)
-    ratio = np.where(usable, distance / np.where(usable, next_distance, 1), 1)
     # Comparing values instead of indices saves the slow search along the columns.
     mutual: BoolArray = best >= column_best[index]
     mutual[:, 1:] = False  # only the first choice can be each other's nearest
+    if not with_ratio:
+        return index, distance, None, mutual
+    next_distance = np.sqrt(np.maximum(2 - 2 * np.where(np.isfinite(beyond), beyond, 1), 0))[:, None]
+    usable = np.isfinite(beyond)[:, None] & (next_distance > 0)
+    ratio = np.where(usable, distance / np.where(usable, next_distance, 1), 1)
     return index, distance, np.minimum(ratio, 1).astype(np.float32), mutual

@@ -112,7 +112,7 @@ class InputMaker:
             self._describe(pair.source),
             self._describe(pair.target),
         )
-        nearest = nearest_features(features, other_features, 1)[0][:, 0]
+        nearest = nearest_features(features, other_features, 1, with_ratio=False)[0][:, 0]
         rows = np.hstack([points, others[nearest]]).astype(np.float64)
         if self.track == "all":
             return rows

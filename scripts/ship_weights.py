@@ -1,8 +1,8 @@
-"""Turn the best weights of a training run into those that ship with the package, in half precision.
+"""Turn the weights of a training run into those that ship with the package, in half precision.
 
-    python scripts/ship_weights.py runs/motions
+    python scripts/ship_weights.py runs/motions [--last]
 
-Reads best.pt and config.yaml of the run folder and writes geomoe3d/filters/weights/geomoe3d.safetensors and
+Reads best.pt, or the averaged weights of last.pt, of the run folder and its config.yaml, and writes geomoe3d/filters/weights/geomoe3d.safetensors and
 its card. Says how far the network's verdicts move by the rounding.
 """
 
@@ -19,6 +19,7 @@ from geomoe3d.filters.pretrained import PACKAGED, WeightCard, load_pretrained, s
 from geomoe3d.provenance import source_commit
 from geomoe3d.training.checkpoint import load_checkpoint
 from geomoe3d.training.config import load_train_config
+from geomoe3d.training.logs import read_csv
 
 NOTES = (
     "GeoMoE that judges motions; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
@@ -29,16 +30,19 @@ NOTES = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="run folder of geomoe3d train")
-    run = parser.parse_args().run
-    state = load_checkpoint(run / "best.pt")
+    parser.add_argument("--last", action="store_true", help="those of the last step, not of the best")
+    given = parser.parse_args()
+    run = given.run
+    state = load_checkpoint(run / ("last.pt" if given.last else "best.pt"))
     model = GeoMoE(load_train_config(str(run / "config.yaml")).network)
-    model.load_state_dict(state["model"])
+    averaged = state.get("averaged")
+    model.load_state_dict(averaged["model"] if given.last and averaged else state["model"])
     card = WeightCard(
         architecture={},
         voxel_size=(0.05, 0.05),
         training_data=str(state.get("data", "")),
         steps=int(state["step"]),
-        metrics=state["metrics"],
+        metrics=state.get("metrics", {}) if not given.last else last_metrics(run),
         commit=source_commit(),
         notes=NOTES,
     )
@@ -47,6 +51,12 @@ def main() -> None:
     save_pretrained(path, model, card, force=True, half=True)
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, step {card.steps}, {card.metrics}")
     print(f"verdicts move by up to {_moved(model.eval(), load_pretrained(path)[0]):.4f}")
+
+
+def last_metrics(run: Path) -> dict[str, float]:
+    """Of the last validation, which is that of the last step."""
+    row = read_csv(run / "validation.csv")[-1]
+    return {name: float(value) for name, value in row.items() if name not in ("step", "best") and value}
 
 
 @torch.no_grad()

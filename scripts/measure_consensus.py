@@ -1,10 +1,10 @@
 """Registration recall and time of consensus and RANSAC on the fixed 1k correspondences of the dev half.
 
-    python scripts/measure_consensus.py [--every 1]
+    python scripts/measure_consensus.py [--every 1] [--no-peer] [--set set_sizes=[10] ...]
 
-Success: rotation error < 15 deg and translation error < 30 cm, strict. Both methods see every pair one
-after the other, so that the ratio of their times holds on a busy machine. Needs the benchmark data
-(GEOMOE3D_DATA).
+--set changes a field of `ConsensusEstimator` (YAML). Success: rotation error < 15 deg and translation error
+< 30 cm, strict. Both methods see every pair one after the other, so that the ratio of their times holds on a
+busy machine. Needs the benchmark data (GEOMOE3D_DATA).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import argparse
 import statistics
 import time
 
+from geomoe3d.config import set_keys
 from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
 from geomoe3d.estimators.base import Estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator
@@ -25,11 +26,15 @@ INLIER_THRESHOLD = 0.10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--every", type=int, default=1, help="take every n-th pair")
-    every = parser.parse_args().every
-    methods: dict[str, Estimator] = {
-        "consensus": ConsensusEstimator(),
-        "Open3D RANSAC 50k": RansacEstimator(iterations=50_000, confidence=0.999),
-    }
+    parser.add_argument("--no-peer", action="store_true", help="leave RANSAC out")
+    parser.add_argument("--set", dest="fields", action="append", default=[], metavar="FIELD=VALUE")
+    given = parser.parse_args()
+    every, changes = given.every, set_keys({}, given.fields)
+    if "set_sizes" in changes:
+        changes["set_sizes"] = tuple(changes["set_sizes"])
+    methods: dict[str, Estimator] = {"consensus": ConsensusEstimator(**{"num_hypotheses": 20, **changes})}
+    if not given.no_peer:
+        methods["Open3D RANSAC 50k"] = RansacEstimator(iterations=50_000, confidence=0.999)
     print("| benchmark | method | pairs | recall | any hypothesis right | median time |")
     print("|---|---|---|---|---|---|")
     for benchmark in BENCHMARKS:
@@ -53,8 +58,9 @@ def main() -> None:
             shares = f"{100 * best[name] / len(pairs):.2f} % | {100 * anywhere[name] / len(pairs):.2f} %"
             median = 1000 * statistics.median(seconds[name])
             print(f"| {benchmark} | {name} | {len(pairs)} | {shares} | {median:.1f} ms |", flush=True)
-        ratio = statistics.median(seconds["consensus"]) / statistics.median(seconds["Open3D RANSAC 50k"])
-        print(f"\nconsensus takes {ratio:.2f} x the median time of RANSAC\n", flush=True)
+        if not given.no_peer:
+            ratio = statistics.median(seconds["consensus"]) / statistics.median(seconds["Open3D RANSAC 50k"])
+            print(f"\nconsensus takes {ratio:.2f} x the median time of RANSAC\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python scripts/ship_weights.py runs/motions [--last]
 
-Reads best.pt, or the averaged weights of last.pt, of the run folder and its config.yaml, and writes geomoe3d/filters/weights/geomoe3d.safetensors and
-its card. Says how far the network's verdicts move by the rounding.
+Reads best.pt, or the averaged weights of last.pt, of the run folder and its config.yaml, and writes
+geomoe3d/filters/weights/geomoe3d.safetensors and its card. Says how far the verdicts move by the rounding.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolve_filter
+from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
 from geomoe3d.threads import single_blas_thread
@@ -77,8 +77,7 @@ class Registrar:
     def __init__(
         self, config: RegistrationConfig | None = None, *, cache: DescriptionCache | None = None
     ) -> None:
-        config = config or RegistrationConfig()
-        self.config = config.model_copy(update={"filter": resolve_filter(config.filter)})
+        self.config = resolved(config)
         self._cache = cache
         self._filter: Filter = make_filter(
             self.config.filter.name, self.config.filter.weights, self.config.estimator

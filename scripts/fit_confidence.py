@@ -116,12 +116,17 @@ def main() -> None:
     parser.add_argument("--unrelated", type=int, default=200)
     parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", default="runs/confidence.jsonl")
+    parser.add_argument("--measured", action="store_true", help="fit on what OUT holds; register nothing")
     given = parser.parse_args()
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import log_loss, roc_auc_score
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
-    records = measure(draw(given.folders, given.pairs, given.unrelated), Path(given.out), given.assignments)
+    if given.measured:
+        records = [json.loads(line) for line in Path(given.out).read_text().splitlines()]
+    else:
+        pairs = draw(given.folders, given.pairs, given.unrelated)
+        records = measure(pairs, Path(given.out), given.assignments)
     records = [r for r in records if r["evidence"] is not None]
     X = np.array([confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"]) for r in records])
     y = np.array([r["right"] for r in records])

@@ -11,7 +11,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.machine import Machine
 from geomoe3d.provenance import usable_cores
 
-_BASE_BYTES = 450 * 2**20  # libraries, one block of the similarity matrix, and described clouds
+_BASE_BYTES = 750 * 2**20  # libraries, torch among them, a block of the similarity matrix, described clouds
 _PER_FILE_BYTE = 5  # binary PLY of single floats: 12 bytes a point in the file, some 60 while it is thinned
 _PER_COMPRESSED_BYTE = 40
 _COMPRESSED = {".laz", ".npz", ".e57", ".glb"}

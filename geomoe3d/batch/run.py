@@ -15,6 +15,7 @@ from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
 from geomoe3d.batch.task import Settings, Task, as_record, register_pair
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError
+from geomoe3d.filters.base import resolved
 from geomoe3d.transform_files import has_transform, save_transform
 from geomoe3d.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
@@ -132,9 +133,10 @@ def register_pairs(
     folder = Path(out)
     if fresh:
         remove_batch(folder)
-    store = BatchStore(folder, config or RegistrationConfig())
+    config = resolved(config)
+    store = BatchStore(folder, config)
     labour = Labour(workers, scheduler, cache)
-    records, kept = work(rows, store, config or RegistrationConfig(), labour, retry, progress, say)
+    records, kept = work(rows, store, config, labour, retry, progress, say)
     outcomes = tuple(store.outcome(records[row.id]) for row in rows)
     store.write_results(records[row.id] for row in rows)
     if transforms:

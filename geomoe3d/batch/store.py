@@ -19,6 +19,7 @@ from geomoe3d.answer import library_versions
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.files import write_atomically
+from geomoe3d.filters.base import DEFAULT_WEIGHTS
 from geomoe3d.journal import Journal, read_journal
 from geomoe3d.provenance import hardware, source_commit
 from geomoe3d.result import RegistrationResult
@@ -163,11 +164,13 @@ def remove_batch(folder: Path) -> None:
 
 
 def _weights_hash(config: RegistrationConfig) -> str | None:
-    """Hash of the filter's weights where they are a file: another training must not mix with the old."""
-    name = config.filter.weights
-    if name is None or not Path(name).is_file():
-        return name
-    return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16]
+    """Hash of the filter's weights, if it has any: another training must not mix with the old."""
+    if config.filter.name != "geomoe":
+        return None
+    from geomoe3d.filters.pretrained import find_weights
+
+    path = find_weights(config.filter.weights or DEFAULT_WEIGHTS)
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _read_identity(path: Path) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from geomoe3d.evaluation.adapter import AdaptedFunction
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
 from geomoe3d.evaluation.records import Answer, Method, MethodInput
-from geomoe3d.filters.base import DEFAULT_WEIGHTS, Filter, FilterOutput, make_filter, resolve_filter
+from geomoe3d.filters.base import DEFAULT_WEIGHTS, Filter, FilterOutput, make_filter, resolved
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.stages import StageClock
 from geomoe3d.types import BoolArray, Correspondences, FloatArray
@@ -117,8 +117,7 @@ class OurMethod:
         keys = {assignment.partition("=")[0].strip() for assignment in assignments}
         if "seed" in keys:
             raise ConfigError("'seed' is that of the evaluation for all methods; leave it out of the values")
-        config = load_config(None, [*OURS[name], *assignments])
-        self.config: RegistrationConfig = config.model_copy(update={"filter": resolve_filter(config.filter)})
+        self.config: RegistrationConfig = resolved(load_config(None, [*OURS[name], *assignments]))
         self._own_threshold = "estimator.inlier_threshold" in keys
         self._registrar: Registrar | None = None
         self._filter: Filter | None = None

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from geomoe3d.config import EstimatorConfig, FilterConfig
+from geomoe3d.config import EstimatorConfig, FilterConfig, RegistrationConfig
 from geomoe3d.errors import ConfigError, DependencyError
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
 
@@ -112,6 +112,12 @@ def resolve_filter(config: FilterConfig) -> FilterConfig:
     shipped = (Path(__file__).parent / "weights" / f"{DEFAULT_WEIGHTS}.safetensors").is_file()
     usable = installed and (config.weights is not None or shipped)
     return config.model_copy(update={"name": "geomoe" if usable else "none"})
+
+
+def resolved(config: RegistrationConfig | None) -> RegistrationConfig:
+    """The configuration, None for the defaults, with ``auto`` replaced by what it means on this machine."""
+    config = config or RegistrationConfig()
+    return config.model_copy(update={"filter": resolve_filter(config.filter)})
 
 
 def make_filter(name: str, weights: str | None = None, estimator: EstimatorConfig | None = None) -> Filter:

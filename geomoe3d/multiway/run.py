@@ -23,6 +23,7 @@ from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.filters.base import resolved
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.journal import read_journal
 from geomoe3d.multiway.alignment import Surface, align_scans
@@ -112,7 +113,7 @@ def register_scans(
     if fresh:
         remove_batch(folder / "pairs")
     clock("look at the scans")
-    config, unusable = _with_voxel_size(config or RegistrationConfig(), folder / "pairs", found)
+    config, unusable = _with_voxel_size(resolved(config), folder / "pairs", found)
     store = BatchStore(folder / "pairs", config)
     room = _Room(found, config, store, Labour(workers, scheduler, cache), progress, say)
     room.describe(unusable)

@@ -152,7 +152,7 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
 def _evidence(evidence: Evidence) -> dict[str, float]:
     """Its numbers by name; without a network there is no verdict."""
     values = {name: value for name, value in asdict(evidence).items() if value is not None}
-    return {**values, "score": evidence.score}
+    return {**values, "surface_score": evidence.surface_score, "score": evidence.score}
 
 
 def _alternative(findings: Findings, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:

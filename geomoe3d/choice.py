@@ -28,16 +28,18 @@ if TYPE_CHECKING:
 
 _CLOSE_LEAD = 2.0
 _KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
-_UNSEEN_VERDICT = -3.0  # of a hypothesis that the network was not shown, as the clouds like others better
+_UNSEEN_VERDICT = -3.0
+_MOST_ROUNDS = 6  # further hypotheses shown one by one, where the network rejects those that the clouds like
 _DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two motions are different
 
 
 class Refined(NamedTuple):
-    """A motion (4, 4) in local coordinates, what the clouds say of it, and what went wrong, if anything."""
+    """A motion (4, 4) in local coordinates, its evidence, what went wrong if anything, and where it began."""
 
     T_target_source: FloatArray
     evidence: Evidence
     note: str | None
+    start: Hypothesis
 
 
 class Chooser:
@@ -63,7 +65,7 @@ class Chooser:
     ) -> None:
         self._described, self._matched, self._threshold = described, matched, threshold
         self._config, self._clock, self._network = config, clock, network
-        self._weighed: list[tuple[FloatArray, FilterOutput]] = []
+        self._weighed: list[tuple[Hypothesis, FilterOutput]] = []
         clock("verify")
         self._verifier = Verifier(*described, threshold, seed=config.seed)
         self._refiner = Refiner(*described, config.refinement)
@@ -104,56 +106,72 @@ class Chooser:
         information = measure_information(T, source, target, self._threshold)
         support = self._support(T)
         judgement = judge(answer.evidence, lead, support, information, self._config.judgement, rival)
-        findings = Findings(T, other, lead, answer.evidence, information, judgement, self._weights_under(T))
+        findings = Findings(
+            T, other, lead, answer.evidence, information, judgement, self._weights_under(answer.start)
+        )
         return findings if answer.note is None else findings.with_note(answer.note)
 
     def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
-        """Get the network's verdicts on the distinct hypotheses that the clouds like best, and rank anew."""
+        """Show the network the distinct hypotheses that the clouds like best, and whatever leads after that.
+
+        A hypothesis that it was not shown ranks as if its verdict were as bad as the worst shown, or -3.
+        """
         by_clouds = sorted(self._ranked, key=lambda pair: -pair[1].surface_score)
-        best = distinct(by_clouds, self._described[0], self._shift, count)
-        shown = [h for h in best if h.verdict is None]
+        shown = distinct(by_clouds, self._described[0], self._shift, count)
+        for _ in range(_MOST_ROUNDS):
+            if not self._show(network, [h for h in shown if h.verdict is None]):
+                return
+            if self._ranked[0][0].verdict is not None:
+                return
+            shown = [self._ranked[0][0]]
+
+    def _show(self, network: Callable[[FloatArray], list[Judged]], shown: list[Hypothesis]) -> bool:
+        """Get verdicts and rank anew; False where the network says nothing of these correspondences."""
         judged = network(np.array([h.T_target_source for h in shown])) if shown else []
-        said = {id(h): found for h, found in zip(shown, judged, strict=False)}
+        if len(judged) < len(shown):
+            return False
+        said = {id(h): found for h, found in zip(shown, judged, strict=True)}
+        known = [h.verdict for h, _ in self._ranked if h.verdict is not None]
+        unseen = min([_UNSEEN_VERDICT, *known, *(found.verdict for found in judged)])
         ranked = []
         for hypothesis, evidence in self._ranked:
             found = said.get(id(hypothesis))
             if found is not None:
-                self._weighed.append((hypothesis.T_target_source, found.output))
                 hypothesis = replace(hypothesis, verdict=found.verdict)
-            verdict = _UNSEEN_VERDICT if hypothesis.verdict is None else hypothesis.verdict
+                self._weighed.append((hypothesis, found.output))
+            verdict = unseen if hypothesis.verdict is None else hypothesis.verdict
             ranked.append((hypothesis, replace(evidence, verdict=verdict)))
         self._ranked = best_first(ranked)
+        return True
 
-    def _weights_under(self, T_target_source: FloatArray) -> FilterOutput | None:
-        """What the network said of the correspondences under the motion nearest to the answer, or None."""
-        if not self._weighed:
-            return None
-        return min(self._weighed, key=lambda entry: float(np.abs(entry[0] - T_target_source).sum()))[1]
+    def _weights_under(self, hypothesis: Hypothesis | None) -> FilterOutput | None:
+        """What the network said of the correspondences under a motion; None where it was not asked."""
+        return next((output for shown, output in self._weighed if shown is hypothesis), None)
 
     def _answer(self, num_refined: int) -> Refined | None:
         """The motion that the clouds, or without verification the correspondences, like best, refined."""
         if self._first is None:
             return None
         if not self._config.verification.enabled:
-            return self._refine(self._first.T_target_source, None)
-        best = distinct(self._ranked, self._described[0], self._shift, num_refined)
-        verdicts = {id(h): evidence.verdict for h, evidence in self._ranked}
-        refined = (self._refine(h.T_target_source, verdicts[id(h)]) for h in best)
-        return max(refined, key=lambda found: found.evidence.score)
+            return self._refine(self._first, None)
+        judged = [(h, evidence) for h, evidence in self._ranked if h.verdict is not None]
+        best = distinct(judged or self._ranked, self._described[0], self._shift, num_refined)
+        return max((self._refine(h, h.verdict) for h in best), key=lambda found: found.evidence.score)
 
-    def _refine(self, T_target_source: FloatArray, verdict: float | None) -> Refined:
+    def _refine(self, hypothesis: Hypothesis, verdict: float | None) -> Refined:
         """The motion refined on the clouds, or as it was where that made them fit less well.
 
         The network's ``verdict`` on the motion before holds for the refined one too.
         """
+        T_target_source = hypothesis.T_target_source
         T, note = self._refiner(T_target_source)
         before, after = (
             replace(self._verifier.evidence(motion), verdict=verdict) for motion in (T_target_source, T)
         )
         if after.score < _KEPT_EVIDENCE * before.score:
             note = "refinement made the clouds fit less well; the unrefined motion is given"
-            return Refined(T_target_source, before, note)
-        return Refined(T, after, note)
+            return Refined(T_target_source, before, note, hypothesis)
+        return Refined(T, after, note, hypothesis)
 
     def _rival(self, answer: Refined) -> tuple[Hypothesis | None, float, Evidence | None]:
         """The best clearly different motion, the answer's lead over it, and its evidence."""
@@ -161,7 +179,7 @@ class Chooser:
         other = clearly_different(self._ranked, T, source, self._shift)
         lead = lead_over(answer.evidence, other[1] if other else None)
         if other is not None and lead < _CLOSE_LEAD:  # a fair race: the rival is refined too
-            rival = self._refine(other[0].T_target_source, other[1].verdict)
+            rival = self._refine(other[0], other[1].verdict)
             if rival.evidence.score > other[1].score:
                 moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
                 other = clearly_different([moved], T, source, self._shift) or other

@@ -1,10 +1,13 @@
-"""The method on one screen: load, prepare, describe, match, weigh, solve, verify, refine, judge."""
+"""The method on one screen: load, prepare, describe, match, weigh, solve, verify, refine, judge.
+
+A network that judges motions weighs after the clouds have verified what was proposed, see `_shows_motions`.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +26,7 @@ from geomoe3d.clouds.prepare import (
     prepare,
     scale_mismatch,
 )
-from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
@@ -46,7 +49,8 @@ class Explanation:
         result: the answer.
         source, target: the clouds as loaded, full resolution, local coordinates.
         correspondences: what was given to the estimator, local coordinates; empty where it never came to it.
-        weighed: what the filter said of them, in the same order.
+        weighed: what the filter said of them, in the same order; of a network that judges motions, what it
+            said under the answer before refinement, all zero where there was none.
         inliers: (K,) True where a correspondence agrees with the answer.
     """
 
@@ -72,6 +76,8 @@ class Registrar:
 
     Raises:
         ConfigError: an unknown filter or estimator.
+        CheckpointError: trained weights are missing, broken or do not fit.
+        DependencyError: a library that the filter needs is not installed.
     """
 
     def __init__(
@@ -121,6 +127,8 @@ class Registrar:
     def filter(self, correspondences: ArrayLike, *, voxel_size: float) -> FloatArray:
         """Weights (N,) in [0, 1] for anybody's correspondences (N, 6) = [source xyz, target xyz].
 
+        A sensor is believed to have stood at zero where that lies within one extent of both halves.
+
         Args:
             correspondences: (N, 6) in one unit of length.
             voxel_size: the scale of the points' noise, same unit: the grid they came from.
@@ -131,7 +139,10 @@ class Registrar:
         rows = np.asarray(correspondences, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[1] != 6 or not np.isfinite(rows).all():
             raise InputError(f"correspondences must be finite numbers of shape (N, 6), found {rows.shape}")
-        return self._filter(Correspondences(rows), voxel_size=voxel_size, seed=self.config.seed).weights
+        zero = np.zeros(3)
+        views = believed_viewpoints(rows, (zero, zero)) if len(rows) else None
+        given = Correspondences(rows, viewpoints=views)
+        return self._filter(given, voxel_size=voxel_size, seed=self.config.seed).weights
 
     def explain(
         self,
@@ -155,7 +166,7 @@ class Registrar:
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         threshold = config.estimator.inlier_threshold * voxel_size
         described = self.describe(*clouds, voxel_size, clock)
-        matched, weighed, hypotheses = self.propose(described, clock)
+        matched, weighed, hypotheses = self.propose(described, clock, self._believed_viewpoints(clouds))
         with single_blas_thread():
             chooser = Chooser(
                 described, matched, threshold, config, clock, self._ask_about(matched, voxel_size)
@@ -173,7 +184,8 @@ class Registrar:
                 f"a voxel size of {wanted:.4g} gives more than {config.preparation.max_points} voxels; "
                 f"{voxel_size:.4g} was used (preparation.max_points sets the limit)"
             )
-        weighed = findings.weighed or weighed
+        if self._shows_motions:  # nothing weighs anything where no motion was found
+            weighed = findings.weighed or FilterOutput(np.zeros(len(matched)))
         result = finished_result(described, matched, findings, config, threshold, clock.stop())
         inliers = findings.residuals(matched) < threshold
         return Explanation(result, *clouds, matched, weighed, inliers)
@@ -205,17 +217,21 @@ class Registrar:
         return self._cache.fetch(cloud, voxel_size, viewpoint, config, seed=seed, make=make)
 
     def propose(
-        self, described: tuple[PreparedCloud, PreparedCloud], clock: StageClock
+        self,
+        described: tuple[PreparedCloud, PreparedCloud],
+        clock: StageClock,
+        viewpoints: tuple[FloatArray, FloatArray] | None = None,
     ) -> tuple[Correspondences, FilterOutput, list[Hypothesis]]:
-        """Match, weigh and solve."""
+        """Match, weigh and solve; ``viewpoints`` are where the sensors are believed to have stood."""
         config, voxel_size = self.config, described[0].voxel_size
         clock("match")
         matched = match(*described, config.matching, seed=config.seed, with_ratio=self._wants_ratio)
+        matched = replace(matched, viewpoints=viewpoints)
         clock("weigh")
-        if self._judge is None or config.estimator.name == "svd":
-            weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
-        else:  # it is shown the motions that the clouds like best, later
+        if self._shows_motions:  # that comes later: those that the clouds like best
             weighed = FilterOutput(np.ones(len(matched)))
+        else:
+            weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
         clock("solve")
         threshold = config.estimator.inlier_threshold * voxel_size
         return matched, weighed, self.solve(matched, weighed, threshold)
@@ -237,7 +253,9 @@ class Registrar:
         return self.propose((source, target), clock)[2]
 
     def solve(self, matched: Correspondences, weighed: FilterOutput, threshold: float) -> list[Hypothesis]:
-        """What the estimator proposes for weighted correspondences."""
+        """What the estimator proposes for weighted correspondences, or the filter has judged already."""
+        if weighed.hypotheses and self.config.estimator.name == "consensus":
+            return list(weighed.hypotheses)
         return propose(
             self._estimator,
             matched,
@@ -247,12 +265,31 @@ class Registrar:
             seed=self.config.seed,
         )
 
+    @property
+    def _shows_motions(self) -> bool:
+        """Whether a network is shown motions after they are proposed and verified, not before as a filter.
+
+        Least squares needs its weights, and without verification nothing says which motions to show.
+        """
+        return (
+            self._judge is not None
+            and self.config.verification.enabled
+            and self.config.estimator.name != "svd"
+        )
+
+    def _believed_viewpoints(
+        self, clouds: tuple[PointCloud, PointCloud]
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Sensor places that are known, not guessed: the network was trained on true ones, or none."""
+        source, target = find_viewpoints(*clouds, self.config.preparation.viewpoint)
+        return None if source is None or target is None else (source, target)
+
     def _ask_about(
         self, matched: Correspondences, voxel_size: float
     ) -> Callable[[FloatArray], list[Judged]] | None:
         """The network's opinion of motions of these correspondences, or None without a network for that."""
         judge = self._judge
-        if judge is None:
+        if judge is None or not self._shows_motions:
             return None
         return lambda motions: judge.judge(matched, motions, voxel_size=voxel_size)
 

@@ -66,7 +66,11 @@ def measure(
     """One record per pair and look; those in the file are kept."""
     out.parent.mkdir(parents=True, exist_ok=True)
     lines = out.read_text().splitlines() if out.exists() else []
-    known = {(r["source"], r["target"], r["look"]): r for r in map(json.loads, lines)}
+    known = {
+        (r["source"], r["target"], r["look"]): r
+        for r in map(json.loads, lines)
+        if r["assignments"] == assignments
+    }
     registrars = [Registrar(load_config(None, [*assignments, *look])) for look in LOOKS]
     with out.open("a") as file:
         for number, (scene, source, target, T) in enumerate(pairs):
@@ -86,6 +90,7 @@ def measure(
                     "source": source,
                     "target": target,
                     "look": look,
+                    "assignments": assignments,
                     "related": T is not None,
                     "right": right,
                     "status": result.status,
@@ -113,7 +118,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folders", nargs="+")
     parser.add_argument("--pairs", type=int, default=500)
-    parser.add_argument("--unrelated", type=int, default=200)
+    parser.add_argument("--unrelated", type=int, default=250)
     parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", default="runs/confidence.jsonl")
     parser.add_argument("--measured", action="store_true", help="fit on what OUT holds; register nothing")
@@ -124,6 +129,7 @@ def main() -> None:
 
     if given.measured:
         records = [json.loads(line) for line in Path(given.out).read_text().splitlines()]
+        records = [r for r in records if r["assignments"] == given.assignments]
     else:
         pairs = draw(given.folders, given.pairs, given.unrelated)
         records = measure(pairs, Path(given.out), given.assignments)
@@ -155,7 +161,7 @@ def main() -> None:
             f"{(p[~related] > least).mean():.2%} of the unrelated"
         )
     model.fit(X, y, sample_weight=weight)
-    print(f"{', '.join(CONFIDENCE_INPUTS)}: {np.round(model.coef_[0], 3).tolist()}")
+    print(f"{', '.join(CONFIDENCE_INPUTS[: X.shape[1]])}: {np.round(model.coef_[0], 3).tolist()}")
     print(f"offset: {model.intercept_[0]:.3f}")
 
 

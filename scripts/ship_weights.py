@@ -13,9 +13,9 @@ from pathlib import Path
 
 import torch
 
-from geomoe3d.filters.base import DEFAULT_WEIGHTS
 from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.pretrained import PACKAGED, WeightCard, load_pretrained, save_pretrained
+from geomoe3d.filters.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, PACKAGED
 from geomoe3d.provenance import source_commit
 from geomoe3d.training.checkpoint import load_checkpoint
 from geomoe3d.training.config import load_train_config

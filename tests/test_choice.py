@@ -148,9 +148,9 @@ def grids_seen(monkeypatch):
     seen: list[float] = []
     propose = Registrar.propose
 
-    def spy(self, described, clock):
+    def spy(self, described, clock, viewpoints=None):
         seen.append(round(described[0].voxel_size / VOXEL, 6))
-        return propose(self, described, clock)
+        return propose(self, described, clock, viewpoints)
 
     monkeypatch.setattr(Registrar, "propose", spy)
     return seen

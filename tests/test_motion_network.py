@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,23 +13,28 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.config import ConfigError, EstimatorConfig, build_config
-from geomoe3d.errors import CheckpointError, FormatError, InputError
+from geomoe3d.clouds.viewpoint import believed_viewpoints
+from geomoe3d.config import ConfigError, EstimatorConfig, FilterConfig, build_config
+from geomoe3d.data.shards import DescribedScene
+from geomoe3d.data.shards import write_shard as write_described
+from geomoe3d.errors import CheckpointError, FormatError, InputError, OutputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.filters.aligned import CHANNELS, AlignedChannels
 from geomoe3d.filters.architecture import CHANNEL_WIDTHS, NetworkConfig
+from geomoe3d.filters.base import resolve_filter
 from geomoe3d.filters.folded import FoldedGeoMoE
 from geomoe3d.filters.geomoe import PRIOR_KERNEL, GeoMoE
 from geomoe3d.filters.geomoe_filter import GeoMoEFilter
 from geomoe3d.filters.inputs import collate, motion_inputs, pair_input
 from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
+from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
 from geomoe3d.training.batches import choose_motions, make_batch, make_sample
-from geomoe3d.training.config import DataConfig, TrainConfig, load_train_config
+from geomoe3d.training.config import TrainConfig, load_train_config
 from geomoe3d.training.losses import verdict_loss
 from geomoe3d.training.measures import best_of_pair, evaluate
-from geomoe3d.training.motions import with_motions
+from geomoe3d.training.motions import NUM_MOTIONS, propose_motions, with_motions
 from geomoe3d.training.pairs import ShardFolder, TrainingPair, write_shard
 from geomoe3d.types import Correspondences, FloatArray
 
@@ -269,7 +275,6 @@ def test_settings_that_do_not_fit_a_network_that_judges_motions_are_refused() ->
     with pytest.raises(ConfigError, match="best_metric=verdict"):
         build_config(TrainConfig, {"validation": {"best_metric": "verdict"}})
     assert load_train_config("configs/train/motions.yaml").network.judges_motions
-    assert DataConfig().motions_per_pair == 8
 
 
 def test_filter_judges_what_consensus_proposes() -> None:
@@ -294,11 +299,108 @@ def test_each_network_has_its_own_filter() -> None:
 def test_mutual_rows_come_first() -> None:
     rows, _ = scene(4)
     mutual = np.arange(len(rows)) % 3 == 0
-    few = likeliest_rows(Correspondences(rows, mutual=mutual), 120)
+    few = likeliest_rows(Correspondences(rows, mutual=mutual), 120, 0)
     assert few.mutual is not None
     assert len(few) == 120
     assert few.mutual.sum() == mutual.sum()
-    assert likeliest_rows(few, 120) is few
+    assert likeliest_rows(few, 120, 0) is few
+
+
+def test_more_rows_than_are_judged_are_all_weighed_wherever_they_stand() -> None:
+    rows, _ = scene(4, count=1500)
+    rows = rows[np.argsort(rows[:, 0])]
+    rows[:3] = np.nan
+    few = likeliest_rows(Correspondences(rows), 1000, 0)
+    assert np.nanmax(few.source[:, 0]) > 0.9 * np.nanmax(rows[:, 0])  # spread, not the first thousand
+    rows = np.vstack([np.full((1000, 6), np.nan), rows])
+    found = MotionJudge(network())(Correspondences(rows), voxel_size=VOXEL)
+    assert found.hypotheses
+    assert found.weights.shape == (2500,)
+    assert not found.weights[:1003].any()
+    assert found.logits is not None
+    assert np.isfinite(found.logits[1003:]).all()
+
+
+def test_no_motions_are_no_channels() -> None:
+    rows, _ = scene()
+    assert aligned(rows, np.zeros((0, 4, 4))).shape == (0, 300, len(CHANNELS))
+    assert MotionJudge(network()).judge(Correspondences(rows), np.zeros((0, 4, 4)), voxel_size=VOXEL) == []
+
+
+def test_one_thread_is_the_callers_own_and_ends() -> None:
+    torch.set_num_threads(2)
+    seen = []
+
+    def other() -> None:
+        with single_torch_thread(), single_torch_thread():
+            seen.append(torch.get_num_threads())
+
+    with single_torch_thread():
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        seen.append(torch.get_num_threads())
+    assert seen == [1, 1]
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(1)
+
+
+def test_auto_takes_the_network_where_it_can_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert resolve_filter(FilterConfig()).name == "geomoe"
+    assert resolve_filter(FilterConfig(name="spectral")).name == "spectral"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert resolve_filter(FilterConfig()).name == "none"
+    assert resolve_filter(FilterConfig(weights="mine.safetensors")).name == "geomoe"  # and says what lacks
+    monkeypatch.undo()
+    monkeypatch.setattr("geomoe3d.filters.base.packaged_names", list)
+    assert resolve_filter(FilterConfig()).name == "none"
+
+
+def test_bare_correspondences_have_their_sensors_at_the_origins_that_are_near() -> None:
+    rows, _ = scene()
+    zero = np.zeros(3)
+    found = believed_viewpoints(rows, (zero, zero))
+    assert found is not None
+    np.testing.assert_array_equal(found, np.zeros((2, 3)))
+    assert believed_viewpoints(rows, (zero, np.array([3e5, 0, 0]))) is None
+
+
+@pytest.fixture
+def shards(tmp_path: Path) -> Path:
+    """One described scene of two fragments that see one corner."""
+    rng = np.random.default_rng(0)
+    T = make_transform(Rotation.from_rotvec([0.0, 0.2, 0.0]).as_matrix(), np.array([0.2, 0.0, 0.1]))
+    points = [corner(rng, 900), transform_points(T, corner(rng, 900))]
+    features = rng.normal(size=(900, 33))
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    described = DescribedScene(
+        "corner",
+        np.concatenate(points).astype(np.float32),
+        np.concatenate([features, features]).astype(np.float16),
+        np.array([0, 900, 1800]),
+        np.array([[0, 1]]),
+        T[None],
+        np.array([0.9], dtype=np.float32),
+        VOXEL,
+    )
+    (tmp_path / "features").mkdir()
+    write_described(tmp_path / "features" / "corner", described, {}, "")
+    return tmp_path / "features"
+
+
+def test_motions_are_proposed_once_and_the_run_goes_on(shards: Path, tmp_path: Path) -> None:
+    out = tmp_path / "motions"
+    report = propose_motions(shards, out, 150)
+    assert (report.made, report.kept, report.failed) == (2, 0, ())
+    folder = ShardFolder(out)
+    assert len(folder) == 200
+    pair = folder[0]
+    assert pair.motions is not None
+    assert 1 <= len(pair.motions) <= NUM_MOTIONS
+    again = propose_motions(shards, out, 250)
+    assert (again.made, again.kept) == (1, 2)
+    with pytest.raises(OutputError, match="seed"):
+        propose_motions(shards, out, 50, seed=3)
 
 
 def test_filter_without_any_motion_gives_no_weight() -> None:

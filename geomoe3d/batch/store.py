@@ -19,7 +19,7 @@ from geomoe3d.answer import library_versions
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.files import write_atomically
-from geomoe3d.filters.base import DEFAULT_WEIGHTS
+from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, find_weights
 from geomoe3d.journal import Journal, read_journal
 from geomoe3d.provenance import hardware, source_commit
 from geomoe3d.result import RegistrationResult
@@ -167,8 +167,6 @@ def _weights_hash(config: RegistrationConfig) -> str | None:
     """Hash of the filter's weights, if it has any: another training must not mix with the old."""
     if config.filter.name != "geomoe":
         return None
-    from geomoe3d.filters.pretrained import find_weights
-
     path = find_weights(config.filter.weights or DEFAULT_WEIGHTS)
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 

@@ -267,7 +267,9 @@ def features(
 @command.command(context_settings=HELP)
 @click.argument("features", type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option("--pairs", required=True, type=click.IntRange(min=1), help="Pairs to draw, in hundreds.")
+@click.option(
+    "--pairs", required=True, type=click.IntRange(min=1), help="Pairs to draw, rounded up to whole hundreds."
+)
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Another seed, other pairs."
 )

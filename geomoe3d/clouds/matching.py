@@ -17,7 +17,6 @@ from geomoe3d.types import (
     BoolArray,
     Correspondences,
     Float32Array,
-    FloatArray,
     IntArray,
     PreparedCloud,
 )
@@ -74,19 +73,12 @@ def match(
         distance.ravel(),
         None if ratio is None else ratio.ravel(),
         mutual,
-        _viewpoints(source, target),
     ).take(keep)
     if len(found) <= config.max_correspondences:
         return found
     shuffled = np.random.default_rng(seed).permutation(len(found))
     mutual_first = np.argsort(~mutual[keep][shuffled], kind="stable")
     return found.take(np.sort(shuffled[mutual_first[: config.max_correspondences]]))
-
-
-def _viewpoints(source: PreparedCloud, target: PreparedCloud) -> tuple[FloatArray, FloatArray] | None:
-    if source.viewpoint is None or target.viewpoint is None:
-        return None
-    return source.viewpoint, target.viewpoint
 
 
 def nearest_features(

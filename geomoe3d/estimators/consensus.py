@@ -40,8 +40,9 @@ class ConsensusEstimator:
             larger ones take in wrong correspondences where inliers are rare; more than one, because they err
             on different pairs.
         length_tolerance: difference of lengths that is compatible, in inlier thresholds.
-        num_witnesses: best supported correspondences among which common partners are counted.
-        num_refined: distinct proposals that are refined.
+        num_witnesses: correspondences among which common partners are counted, chosen as seeds are: the best
+            supported, and a quarter spread over the others.
+        num_refined: distinct proposals that are refined, at least ``num_hypotheses``.
         num_refits: rounds of reweighted refinement.
         distinct_angle_deg, distinct_thresholds: two motions are the same when they differ by less than
             this angle and, at the centroid, by less than so many inlier thresholds.
@@ -81,7 +82,9 @@ class ConsensusEstimator:
         # Multiples of 1/1024 add up exactly in float32, in whatever order the threads do it.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
         R, t = self._propose(source, target, vote, self._dense_rows(given, seed))
-        R, t = self._keep_distinct(R, t, score(R, t, source, target, vote), self.num_refined)
+        R, t = self._keep_distinct(
+            R, t, score(R, t, source, target, vote), max(self.num_refined, self.num_hypotheses)
+        )
         for _ in range(self.num_refits):
             R, t = refit(R, t, source, target, vote)
         scores = score(R, t, source, target, vote)

@@ -27,7 +27,8 @@ from geomoe3d.evaluation.adapter import AdaptedFunction
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
 from geomoe3d.evaluation.records import Answer, Method, MethodInput
-from geomoe3d.filters.base import DEFAULT_WEIGHTS, Filter, FilterOutput, make_filter, resolved
+from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
+from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, find_weights
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.stages import StageClock
 from geomoe3d.types import BoolArray, Correspondences, FloatArray
@@ -222,8 +223,6 @@ class OurMethod:
     def _weights_hash(self) -> str | None:
         if self.config.filter.name != "geomoe" or self.absent() is not None:
             return None
-        from geomoe3d.filters.pretrained import find_weights
-
         path = find_weights(self.config.filter.weights or DEFAULT_WEIGHTS)
         return hashlib.sha256(path.read_bytes()).hexdigest()
 

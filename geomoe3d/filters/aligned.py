@@ -4,9 +4,10 @@ Lengths alone cannot tell the true motion from a chance agreement when inliers a
 there is more to ask: do the keypoints of one scan lie on the surface that those of the other trace, do the
 normals agree, and does any of them float where the other scan's sensor looked through? All of it is
 computed from the correspondences' own points, so it works for anybody's correspondences; without the
-sensors' places the free-space channels are zero. The channels do not change when either scan is moved.
+sensors' places the free-space channels are zero. The channels do not change when either scan is moved, but
+for the free-space ones, whose pixels lie otherwise then.
 
-Cost: about 1 ms per motion and 1,000 correspondences.
+Cost: about 10 ms, and 1 ms per motion, for 1,000 correspondences.
 """
 
 from __future__ import annotations
@@ -27,7 +28,19 @@ CHANNELS = (
     "target_near", "target_in_plane", "target_normal", "target_seen", "target_in_front", "target_on_view",
     "matched_normals", "source_planarity", "target_planarity", "source_range", "target_range",
 )  # fmt: skip
-"""Per correspondence, all about within [-1, 1]; see `AlignedChannels`."""
+"""Per correspondence, r its residual in inlier thresholds:
+
+- residual_narrow, residual, residual_wide: exp(-r^2 / (2 s^2)) with s = 0.375, 0.75, 2.
+- vote: 1 / sqrt(number of correspondences that share the target); degree: 5 x the share of correspondences
+  with which this one preserves length; in [0, 5].
+- source_near, source_in_plane, source_normal: for the source point under the motion, the same of its distance
+  to the nearest target keypoint (s = 1.5, 0 beyond 3 thresholds), of its distance to that keypoint's plane
+  (s = 0.5), and the cosine of the two normals. source_seen: 1 where the target's sensor saw something in its
+  direction; source_in_front: how far in front of that, in [0, 1]; source_on_view: how well upon it. target_*:
+  the same of the target point in the source's frame.
+- matched_normals: cosine of the two matched points' normals; source_planarity, target_planarity: in [0, 1];
+  source_range, target_range: distance from the sensor over 40 thresholds, at most 2.
+"""
 
 NUM_CHANNELS = len(CHANNELS)
 _NORMAL_NEIGHBORS = 10
@@ -126,6 +139,8 @@ class AlignedChannels:
             R: (K, 3, 3).
             t: (K, 3) in the unit of the correspondences.
         """
+        if len(R) == 0:
+            return np.zeros((0, len(self.rows), NUM_CHANNELS), dtype=np.float32)
         t = t / self._threshold
         K, N = len(R), len(self.rows)
         out = np.zeros((K, N, NUM_CHANNELS), dtype=np.float32)

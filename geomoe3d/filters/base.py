@@ -10,13 +10,13 @@ import difflib
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from geomoe3d.config import EstimatorConfig, FilterConfig, RegistrationConfig
 from geomoe3d.errors import ConfigError, DependencyError
+from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, packaged_names
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
 
 
@@ -29,8 +29,8 @@ class FilterOutput:
         logits: (N,) raw scores, larger is likelier an inlier, or None.
         groups: (N,) small integers, which part of the filter handled each correspondence, or None.
         group_names: a name for each group, for display.
-        hypotheses: motions that the filter weighed the correspondences under, best first; the estimator
-            need not seek them again. Empty for filters that know none.
+        hypotheses: motions that the filter judged, best first; the weights hold under the first, and the
+            estimator need not seek them again. Empty for filters that know none.
     """
 
     weights: FloatArray
@@ -86,9 +86,6 @@ def _geomoe(weights: str | None, estimator: EstimatorConfig) -> Filter:
     return geomoe_filter(weights, estimator)
 
 
-DEFAULT_WEIGHTS = "geomoe3d"
-"""Name of the weights that ship with the package."""
-
 _FACTORIES: dict[str, Callable[[str | None, EstimatorConfig], Filter]] = {
     "none": _none,
     "spectral": _spectral,
@@ -104,13 +101,13 @@ def filter_names() -> list[str]:
 def resolve_filter(config: FilterConfig) -> FilterConfig:
     """What ``auto`` means on this machine; any other name as it is.
 
-    The network is taken where its libraries are installed and weights are given or ship with the package.
+    The network is taken where weights are given, and where its libraries are installed and weights ship with
+    the package.
     """
     if config.name != "auto":
         return config
     installed = all(importlib.util.find_spec(name) is not None for name in ("torch", "safetensors"))
-    shipped = (Path(__file__).parent / "weights" / f"{DEFAULT_WEIGHTS}.safetensors").is_file()
-    usable = installed and (config.weights is not None or shipped)
+    usable = config.weights is not None or (installed and DEFAULT_WEIGHTS in packaged_names())
     return config.model_copy(update={"name": "geomoe" if usable else "none"})
 
 

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import CheckpointError
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.base import DEFAULT_WEIGHTS, Filter, FilterOutput
+from geomoe3d.filters.base import Filter, FilterOutput
 from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, PairInput, pair_input
 from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
+from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS
 from geomoe3d.types import Correspondences, FloatArray, IntArray
 
 

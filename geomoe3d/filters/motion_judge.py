@@ -136,23 +136,26 @@ class MotionJudge:
         )
         if not found:
             return blind
-        few = likeliest_rows(correspondences, MOST_ROWS)
+        few = likeliest_rows(part, MOST_ROWS, seed)
         first = found[:MOST_MOTIONS]
         motions = np.array([h.T_target_source for h in first])
         judged = self.judge(few, motions, voxel_size=voxel_size)
         order = np.argsort([-j.verdict for j in judged], kind="stable")
         ranked = [replace(first[k], verdict=judged[k].verdict) for k in order]
         output: FilterOutput = judged[order[0]].output
-        if few is not correspondences:
+        if few is not correspondences:  # judged on some rows, weighed on all
             output = self.judge(correspondences, motions[order[:1]], voxel_size=voxel_size)[0].output
         return replace(output, hypotheses=(*ranked, *found[MOST_MOTIONS:]))
 
 
-def likeliest_rows(correspondences: Correspondences, limit: int) -> Correspondences:
-    """At most ``limit`` correspondences, mutual ones first, in their order; the same object if all."""
+def likeliest_rows(correspondences: Correspondences, limit: int, seed: int) -> Correspondences:
+    """At most ``limit`` correspondences in their order: mutual ones first, a seeded choice among equals.
+
+    The same object where there are no more.
+    """
     if len(correspondences) <= limit:
         return correspondences
-    first = np.arange(len(correspondences))
+    chosen = np.random.default_rng(seed).permutation(len(correspondences))
     if correspondences.mutual is not None:
-        first = np.argsort(~correspondences.mutual, kind="stable")
-    return correspondences.take(np.sort(first[:limit]))
+        chosen = chosen[np.argsort(~correspondences.mutual[chosen], kind="stable")]
+    return correspondences.take(np.sort(chosen[:limit]))

@@ -17,10 +17,10 @@ from geomoe3d.errors import CheckpointError, ConfigError
 from geomoe3d.files import write_atomically
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.weight_files import find_weights
 
 _FORMAT = "geomoe3d-weights"
 _VERSION = 1
-PACKAGED = Path(__file__).parent / "weights"
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def load_pretrained(name_or_path: str | Path) -> tuple[GeoMoE, WeightCard]:
 
     Args:
         name_or_path: a .safetensors file with its card beside it, or the name of weights that ship with
-            the package (see `packaged_names`).
+            the package (see `geomoe3d.filters.weight_files`).
 
     Raises:
         CheckpointError: not found, card missing or malformed, hash differs, or tensors do not fit.
@@ -128,27 +128,6 @@ def load_pretrained(name_or_path: str | Path) -> tuple[GeoMoE, WeightCard]:
         )
     model.load_state_dict(tensors)
     return model.eval(), card
-
-
-def find_weights(name_or_path: str | Path) -> Path:
-    """The file that a name or path means.
-
-    Raises:
-        CheckpointError: there is none; the message lists what ships with the package.
-    """
-    path = Path(name_or_path)
-    if path.is_file():
-        return path
-    packaged = PACKAGED / f"{name_or_path}.safetensors"
-    if path.suffix != ".safetensors" and path.name == str(name_or_path) and packaged.is_file():
-        return packaged
-    names = ", ".join(packaged_names()) or "none in this version"
-    raise CheckpointError(f"no weights '{name_or_path}': no such file, and packaged weights are: {names}")
-
-
-def packaged_names() -> list[str]:
-    """Names of the weights that ship with the package."""
-    return sorted(path.stem for path in PACKAGED.glob("*.safetensors"))
 
 
 def read_card(path: str | Path) -> WeightCard:

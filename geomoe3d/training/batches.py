@@ -154,7 +154,11 @@ def choose_motions(
         InputError: the pair has no motions.
     """
     if pair.motions is None or len(pair.motions) == 0:
-        raise InputError("no motions to judge; make the data with 'geomoe3d data motions'")
+        raise InputError(
+            "consensus proposed no motion to judge; leave such pairs out"
+            if pair.motions is not None
+            else "no motions to judge; make the data with 'geomoe3d data motions'"
+        )
     T = pair.T_target_source
     right = np.array(
         [

@@ -7,10 +7,12 @@ than a training step, so it is done once, with the estimator of registration its
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from geomoe3d.data.draw import DrawSettings, FragmentPool
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.proposals import propose
+from geomoe3d.files import write_atomically
 from geomoe3d.training.fragment_pairs import as_training_pair
 from geomoe3d.training.pairs import TrainingPair, write_shard
 from geomoe3d.types import BoolArray, Correspondences
@@ -33,6 +36,7 @@ SETTINGS = DrawSettings(
 among those proposed teach to doubt."""
 
 
+_IDENTITY = "motions.json"
 _PROPOSING = EstimatorConfig(mutual_round=False)
 
 
@@ -66,14 +70,15 @@ def propose_motions(
 
     Raises:
         InputError: no described fragments there.
-        OutputError: the disk refuses.
+        OutputError: the disk refuses, or the folder holds motions of other data, settings or seed.
     """
-    FragmentPool(features, SETTINGS, seed, verify=True)
+    pool_identity = FragmentPool(features, SETTINGS, seed, verify=True).identity()
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder '{out}': {error.strerror}") from None
+    _check_identity(out / _IDENTITY, {"seed": seed, "motions": NUM_MOTIONS, "pool": pool_identity})
     jobs = [
         _Job(Path(features), out / f"motions-{seed:02d}-{k:05d}", seed, k * PAIRS_PER_SHARD)
         for k in range(-(-num_pairs // PAIRS_PER_SHARD))
@@ -88,6 +93,27 @@ def propose_motions(
         if progress is not None:
             progress(done, len(jobs))
     return MotionReport(len(todo) - len(failed), len(jobs) - len(todo), tuple(failed))
+
+
+def _check_identity(path: Path, wanted: dict[str, Any]) -> None:
+    """Refuse to mix motions of two origins in one folder; the first run says which it is."""
+    if not path.exists():
+        text = json.dumps(wanted) + "\n"
+        write_atomically(path, lambda temporary: _put(temporary, text), force=False)
+        return
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        found = {}
+    differs = [key for key in wanted if found.get(key) != wanted[key]]
+    if differs:
+        raise OutputError(
+            f"'{path.parent}' holds motions of another {' and '.join(differs)}; give another folder"
+        )
+
+
+def _put(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -129,9 +155,8 @@ def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> Trainin
         mutual: (N,) which matches are mutual, where others are to weigh less, as in registration.
     """
     estimator = ConsensusEstimator(num_hypotheses=NUM_MOTIONS, num_refined=NUM_MOTIONS)
+    threshold = _PROPOSING.inlier_threshold * pair.voxel_size
     rows = Correspondences(pair.correspondences.astype(np.float64), mutual=mutual)
-    found = propose(
-        estimator, rows, np.ones(len(rows)), _PROPOSING, inlier_threshold=2 * pair.voxel_size, seed=0
-    )
+    found = propose(estimator, rows, np.ones(len(rows)), _PROPOSING, inlier_threshold=threshold, seed=0)
     motions = np.array([h.T_target_source for h in found]).reshape(-1, 4, 4)
     return replace(pair, motions=motions, viewpoints=np.zeros((2, 3)))

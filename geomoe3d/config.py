@@ -62,8 +62,8 @@ class FilterConfig(Section):
 
     name: str = Field(
         "auto",
-        description="none, spectral (needs no training), geomoe (the network), or auto: geomoe with the "
-        "shipped weights where torch is installed, else none",
+        description="none, spectral (needs no training), geomoe (the network), or auto: geomoe where "
+        "weights are given or torch is installed, else none",
     )
     weights: str | None = Field(
         None, description="trained weights of geomoe: a .safetensors file or a shipped name"

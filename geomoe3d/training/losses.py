@@ -1,8 +1,8 @@
-"""What the network is trained for: right labels, a right motion, and experts that share the work.
+"""What the network is trained for: right labels, a right motion, experts that share the work, a true verdict.
 
-Every term is computed per layer and summed over the layers, as in the paper. All work on padded batches,
-in float32 outside autocast, and all gradients are finite for degenerate pairs (no inlier, no positive
-weight, collinear points). Cost: linear in N.
+The first three are computed per layer and summed over the layers, as in the paper; the verdict is one. All
+work on padded batches, in float32 outside autocast, and all gradients are finite for degenerate pairs (no
+inlier, no positive weight, collinear points). Cost: linear in N.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MIN_POSITIVE = 3
 
 
 class LossConfig(Section):
-    """Weights and forms of the three terms."""
+    """Weights and forms of the terms."""
 
     regression_weight: float = Field(0.5, ge=0, description="of the geometric term after the warm-up")
     regression_warmup: float = Field(0.04, ge=0, le=1, description="share of the schedule without it")

@@ -17,12 +17,13 @@ from geomoe3d.result import Status
 from geomoe3d.types import FloatArray, PreparedCloud
 from geomoe3d.verification import MOST_VERDICT, Evidence
 
-# Fitted by scripts/fit_confidence.py on 500 pairs of generated rooms and a recorded one, mixed by overlap as
-# the benchmarks are, and 250 unrelated ones; docs/measurements.md holds what came of it on real scans.
-_OFFSET = 7.14
-_SLOPES = np.array([2.68, 2.26, 1.81, -2.86])
-_OFFSET_WITH_VERDICT = 7.14
-_SLOPES_WITH_VERDICT = np.array([2.68, 2.26, 1.81, -2.86, 0.0])
+# Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
+# one, mixed by overlap as the benchmarks are, and on unrelated pairs: 180 and 90 pairs without a network, 300
+# and 150 with one, each with one look and with two; docs/measurements.md holds what came of it on real scans.
+_OFFSET = 8.733
+_SLOPES = np.array([2.711, 0.871, -3.638, 2.403])
+_OFFSET_WITH_VERDICT = -1.027
+_SLOPES_WITH_VERDICT = np.array([1.718, 0.958, -2.531, 0.686])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
 _MOST_LEAD = 30.0
 UNRIVALLED_LEAD = 3.0
@@ -163,27 +164,27 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
     return evidence.score / other.score if other.score > 0 else float("inf")
 
 
-CONFIDENCE_INPUTS = ("log evidence", "log lead", "log support", "log overlap", "verdict")
-"""What the confidence is made of, in the order of `confidence_inputs`; the last one with a network only."""
+CONFIDENCE_INPUTS = ("log evidence", "log lead", "log overlap", "log support")
+"""What the confidence is made of without a network, in the order of `confidence_inputs`; with one, its verdict
+stands in the place of the support, which the network sees itself."""
 
 
 def confidence_inputs(evidence: Evidence, lead: float, support: float) -> FloatArray:
     """(4,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
 
-    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. (5,) with the
-    verdict of a network, bounded, where there is one.
+    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. The last entry
+    is the verdict of the network, bounded, where there is one, and the logarithm of the support where not.
     """
-    logarithms = np.log(
+    shared = np.log(
         [
             max(evidence.surface_score, _LEAST_SCORE),
             min(max(lead, 0.5), _MOST_LEAD),
-            support + _LEAST_SUPPORT,
             evidence.overlap + _LEAST_OVERLAP,
         ]
     )
     if evidence.verdict is None:
-        return logarithms
-    return np.append(logarithms, np.clip(evidence.verdict, -MOST_VERDICT, MOST_VERDICT))
+        return np.append(shared, np.log(support + _LEAST_SUPPORT))
+    return np.append(shared, np.clip(evidence.verdict, -MOST_VERDICT, MOST_VERDICT))
 
 
 def confidence_score(evidence: Evidence, lead: float, support: float) -> float:

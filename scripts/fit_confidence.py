@@ -161,7 +161,9 @@ def main() -> None:
             f"{(p[~related] > least).mean():.2%} of the unrelated"
         )
     model.fit(X, y, sample_weight=weight)
-    print(f"{', '.join(CONFIDENCE_INPUTS[: X.shape[1]])}: {np.round(model.coef_[0], 3).tolist()}")
+    verdicts = "verdict" in records[0]["evidence"]
+    names = (*CONFIDENCE_INPUTS[:-1], "verdict") if verdicts else CONFIDENCE_INPUTS
+    print(f"{', '.join(names)}: {np.round(model.coef_[0], 3).tolist()}")
     print(f"offset: {model.intercept_[0]:.3f}")
 
 

@@ -116,6 +116,8 @@ class Chooser:
 
         A hypothesis that it was not shown ranks as if its verdict were as bad as the worst shown, or -3.
         """
+        if not self._ranked:
+            return
         by_clouds = sorted(self._ranked, key=lambda pair: -pair[1].surface_score)
         shown = distinct(by_clouds, self._described[0], self._shift, count)
         for _ in range(_MOST_ROUNDS):

@@ -27,6 +27,7 @@ _SLOPES_WITH_VERDICT = np.array([1.718, 0.958, -2.531, 0.686])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
 _MOST_LEAD = 30.0
 UNRIVALLED_LEAD = 3.0
+_LIKELY = 0.5
 _CLOSE_VERDICTS = 2.0  # odds of seven to one
 _LEAST_OBSERVABILITY = 0.005
 _LOW_OVERLAP = 0.1
@@ -106,7 +107,7 @@ def judge(
         rival: of the best clearly different motion, if there is one.
 
     Returns:
-        ``ambiguous`` where the surfaces let the source slide, or where the evidence would do but another
+        ``ambiguous`` where the surfaces let the source slide, or where the answer would be likely but another
         motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
     confidence = confidence_score(evidence, lead, support)
@@ -125,10 +126,10 @@ def judge(
             "plain, like a single plane or cylinder"
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
-    # Without a rival it would do, by the clouds alone: the network doubts what it has seen no like of.
+    # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
     alone = confidence_score(replace(evidence, verdict=None), UNRIVALLED_LEAD, support)
     close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(evidence, rival, config.ambiguity_ratio)
-    if close and alone >= config.min_confidence:
+    if close and alone >= _LIKELY:
         notes.append(
             f"a clearly different motion does {min(100 / lead, 100):.0f} % as well; see the alternative, "
             "the scans may show repeated or symmetric structure"
@@ -165,8 +166,9 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
 
 
 CONFIDENCE_INPUTS = ("log evidence", "log lead", "log overlap", "log support")
-"""What the confidence is made of without a network, in the order of `confidence_inputs`; with one, its verdict
-stands in the place of the support, which the network sees itself."""
+"""What the confidence is made of without a network, in the order of `confidence_inputs`.
+
+With one, its verdict stands in the place of the support, which the network sees itself."""
 
 
 def confidence_inputs(evidence: Evidence, lead: float, support: float) -> FloatArray:

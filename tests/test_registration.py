@@ -149,12 +149,14 @@ def test_unrelated_scans_are_never_ok(pair, seed):
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (1, 2, 3)])
-def test_symmetric_boxes_are_ambiguous_and_show_the_other_motion(size):
+@pytest.mark.parametrize(("name", "least"), [("none", 0.8), ("geomoe", 0.5)])
+def test_symmetric_boxes_are_ambiguous_and_show_the_other_motion(size, name, least):
+    """The clouds like both motions alike; the network may prefer one a little."""
     target = transform_points(MOTION, box(size, 20_000, 1))
-    result = geomoe3d.register(box(size, 20_000, 0), target)
+    result = geomoe3d.register(box(size, 20_000, 0), target, filter={"name": name})
     assert result.status == "ambiguous"
     assert result.alternative is not None
-    assert result.alternative.relative_score > 0.8
+    assert result.alternative.relative_score > least
     assert result.alternative.rotation_difference_deg > 80
 
 

@@ -24,6 +24,7 @@ from geomoe3d.filters.geomoe_filter import Insight, finite_rows, run
 from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, motion_inputs
 from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
+from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import Correspondences, FloatArray
 
 MOST_MOTIONS = 20
@@ -88,6 +89,8 @@ class MotionJudge:
         """Itself; filters that judge no motions have no such attribute."""
         return self
 
+    @single_blas_thread()
+    @single_torch_thread()
     def judge(
         self, correspondences: Correspondences, motions: FloatArray, *, voxel_size: float
     ) -> list[Judged]:
@@ -107,14 +110,15 @@ class MotionJudge:
         views = part.viewpoints or (None, None)
         found = []
         for inputs in motion_inputs(part.points, motions, views, voxel_size, self.config):
-            with single_torch_thread():
-                out = run(self._network, inputs, self.device)
+            out = run(self._network, inputs, self.device)
             assert out.verdict is not None
             insight = Insight.blind(len(correspondences), self.config.num_layers)
             insight.fill(seen, out)
             found.append(Judged(float(out.verdict), insight.output(self.config)))
         return found
 
+    @single_blas_thread()
+    @single_torch_thread()
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
         """Weigh correspondences under the best motion; see `Filter`.
 

@@ -334,7 +334,7 @@ def test_motion_is_found_by_true_weights_and_not_by_none() -> None:
     network = NetworkConfig()
     config = SyntheticConfig(inlier_ratio=(0.2, 0.5), noise=(0.1, 0.2))
     samples = [make_sample(SyntheticPairs(config)[i], network) for i in range(4)]
-    coordinates = torch.stack([s.input.coordinates for s in samples])
+    coordinates = torch.stack([s.inputs[0].coordinates for s in samples])
     truth = torch.stack([s.truth for s in samples])
     labels = torch.stack([s.labels for s in samples])
     logits = torch.where(labels, 2.0, -2.0)

@@ -68,7 +68,8 @@ class RunLogs:
         self._experts = experts
         self._train = CsvLog(folder / "train.csv", _TRAIN_COLUMNS, first_step)
         self._usage = CsvLog(folder / "experts.csv", experts, first_step) if experts else None
-        self._validation = CsvLog(folder / "validation.csv", _VALIDATION_COLUMNS, first_step)
+        columns = [c for c in _VALIDATION_COLUMNS if c != "verdict_recall" or network.judges_motions]
+        self._validation = CsvLog(folder / "validation.csv", columns, first_step)
         self.board = TensorBoardLog(folder, first_step, config.logging.tensorboard)
 
     def training(self, step: int, values: dict[str, float]) -> None:

@@ -26,11 +26,11 @@ from geomoe3d.clouds.prepare import (
     prepare,
     scale_mismatch,
 )
-from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints
+from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
-from geomoe3d.estimators.proposals import propose
+from geomoe3d.estimators.proposals import solve
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
@@ -38,7 +38,7 @@ from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 if TYPE_CHECKING:
-    from geomoe3d.filters.motion_judge import Judged, MotionJudge
+    from geomoe3d.filters.motion_judge import Judged
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Registrar:
         )
         network = getattr(self._filter, "config", None)
         self._wants_ratio = "ratio" in getattr(network, "extra_channels", ())
-        self._judge: MotionJudge | None = getattr(self._filter, "as_judge", None)
+        self._judge: Callable[..., list[Judged]] | None = getattr(self._filter, "judge", None)
         self._estimator: Estimator = make_estimator(self.config.estimator)
 
     @classmethod
@@ -166,7 +166,9 @@ class Registrar:
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         threshold = config.estimator.inlier_threshold * voxel_size
         described = self.describe(*clouds, voxel_size, clock)
-        matched, weighed, hypotheses = self.propose(described, clock, self._believed_viewpoints(clouds))
+        # Known places, not guessed ones: the network was trained on true ones, or none.
+        viewpoints = known_viewpoints(*clouds, config.preparation.viewpoint)
+        matched, weighed, hypotheses = self.propose(described, clock, viewpoints)
         with single_blas_thread():
             chooser = Chooser(
                 described, matched, threshold, config, clock, self._ask_about(matched, voxel_size)
@@ -234,7 +236,10 @@ class Registrar:
             weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
         clock("solve")
         threshold = config.estimator.inlier_threshold * voxel_size
-        return matched, weighed, self.solve(matched, weighed, threshold)
+        found = solve(
+            self._estimator, matched, weighed, config.estimator, inlier_threshold=threshold, seed=config.seed
+        )
+        return matched, weighed, found
 
     def propose_on_grid(
         self, voxel_size: float, described: tuple[PreparedCloud, PreparedCloud], clock: StageClock
@@ -252,19 +257,6 @@ class Registrar:
             return []
         return self.propose((source, target), clock)[2]
 
-    def solve(self, matched: Correspondences, weighed: FilterOutput, threshold: float) -> list[Hypothesis]:
-        """What the estimator proposes for weighted correspondences, or the filter has judged already."""
-        if weighed.hypotheses and self.config.estimator.name == "consensus":
-            return list(weighed.hypotheses)
-        return propose(
-            self._estimator,
-            matched,
-            weighed.weights,
-            self.config.estimator,
-            inlier_threshold=threshold,
-            seed=self.config.seed,
-        )
-
     @property
     def _shows_motions(self) -> bool:
         """Whether a network is shown motions after they are proposed and verified, not before as a filter.
@@ -277,13 +269,6 @@ class Registrar:
             and self.config.estimator.name != "svd"
         )
 
-    def _believed_viewpoints(
-        self, clouds: tuple[PointCloud, PointCloud]
-    ) -> tuple[FloatArray, FloatArray] | None:
-        """Sensor places that are known, not guessed: the network was trained on true ones, or none."""
-        source, target = find_viewpoints(*clouds, self.config.preparation.viewpoint)
-        return None if source is None or target is None else (source, target)
-
     def _ask_about(
         self, matched: Correspondences, voxel_size: float
     ) -> Callable[[FloatArray], list[Judged]] | None:
@@ -291,7 +276,7 @@ class Registrar:
         judge = self._judge
         if judge is None or not self._shows_motions:
             return None
-        return lambda motions: judge.judge(matched, motions, voxel_size=voxel_size)
+        return lambda motions: judge(matched, motions, voxel_size=voxel_size)
 
 
 def register(

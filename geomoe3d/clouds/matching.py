@@ -13,13 +13,7 @@ import numpy as np
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
 from geomoe3d.threads import single_blas_thread
-from geomoe3d.types import (
-    BoolArray,
-    Correspondences,
-    Float32Array,
-    IntArray,
-    PreparedCloud,
-)
+from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
 
 _BLOCK_ENTRIES = 12_000_000
 _SMALL_ENTRIES = 100_000_000  # up to 10,000 against 10,000 points one thread is about as fast as two

@@ -35,6 +35,14 @@ def find_viewpoints(
     return -source.origin, -target.origin
 
 
+def known_viewpoints(
+    source: PointCloud, target: PointCloud, rule: str
+) -> tuple[FloatArray, FloatArray] | None:
+    """`find_viewpoints` as one value: both places, or None."""
+    first, second = find_viewpoints(source, target, rule)
+    return None if first is None or second is None else (first, second)
+
+
 def believed_viewpoints(
     correspondences: FloatArray, origins: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray] | None:
@@ -44,9 +52,8 @@ def believed_viewpoints(
         correspondences: N >= 1 rows [source, target].
         origins: (3,) shifts that were removed from the two halves.
     """
-    halves = correspondences[:, :3], correspondences[:, 3:]
-    clouds = [PointCloud(half, origin) for half, origin in zip(halves, origins, strict=True)]
-    return (-origins[0], -origins[1]) if all(_origin_is_near(cloud) for cloud in clouds) else None
+    source, target = (PointCloud(correspondences[:, 3 * k : 3 * k + 3], origins[k]) for k in range(2))
+    return known_viewpoints(source, target, "auto")
 
 
 def _origin_is_near(cloud: PointCloud) -> bool:

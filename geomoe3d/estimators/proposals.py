@@ -10,6 +10,7 @@ import numpy as np
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator
+from geomoe3d.filters.base import FilterOutput
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis
 
 
@@ -39,3 +40,21 @@ def propose(
         rows = matched.mutual
         found += estimate(matched.points[rows], weights[rows], inlier_threshold=inlier_threshold, seed=seed)
     return found
+
+
+def solve(
+    estimate: Estimator,
+    matched: Correspondences,
+    weighed: FilterOutput,
+    config: EstimatorConfig,
+    *,
+    inlier_threshold: float,
+    seed: int,
+) -> list[Hypothesis]:
+    """Hypotheses for weighed correspondences: what a filter has judged already, or what `propose` gives.
+
+    Only consensus is not sought twice: it is what such a filter asked itself. See `propose` for the rest.
+    """
+    if weighed.hypotheses and config.name == "consensus":
+        return list(weighed.hypotheses)
+    return propose(estimate, matched, weighed.weights, config, inlier_threshold=inlier_threshold, seed=seed)

@@ -23,6 +23,7 @@ from geomoe3d.clouds.viewpoint import believed_viewpoints
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.estimators.base import make_estimator
+from geomoe3d.estimators.proposals import solve
 from geomoe3d.evaluation.adapter import AdaptedFunction
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
@@ -178,9 +179,14 @@ class OurMethod:
         matched = Correspondences(local, viewpoints=believed_viewpoints(local, origins))
         weighed = self._filter(matched, voxel_size=given.voxel_size, seed=given.seed)
         clock("solve")
-        found = list(weighed.hypotheses)
-        if not found or self.config.estimator.name != "consensus":
-            found = self._estimator(local, weighed.weights, inlier_threshold=threshold, seed=given.seed)
+        found = solve(
+            self._estimator,
+            matched,
+            weighed,
+            self.config.estimator,
+            inlier_threshold=threshold,
+            seed=given.seed,
+        )
         stages = _stages(clock.stop())
         motions = [shift_frames(hypothesis.T_target_source, *origins) for hypothesis in found]
         return Answer(

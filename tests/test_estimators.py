@@ -515,8 +515,10 @@ def test_the_same_bytes_twice_whatever_was_drawn_before(estimator) -> None:
 
 
 def test_ransac_draws_by_its_seed() -> None:
-    rows, _, _ = problem(13, inliers=0.3, noise=0.02)
-    few = RansacEstimator(iterations=300)
+    rows, _, _ = problem(13, inliers=0.05, noise=0.02)
+    few = RansacEstimator(
+        iterations=3000
+    )  # too few among so many wrong rows: what is found depends on the draw
     answers = {few(rows, inlier_threshold=THRESHOLD, seed=s)[0].T_target_source.tobytes() for s in range(4)}
     assert len(answers) > 1
 

@@ -124,7 +124,9 @@ def test_same_seed_same_answer():
 
 def test_seed_of_the_input_reaches_the_estimator():
     rows = correspondences(0.1, count=800)
-    method = make_method("geomoe3d", ["estimator.name=ransac", "estimator.ransac_iterations=300"])
+    # Too few samples among too many wrong rows: what is found depends on the draw.
+    few = ["filter.name=none", "estimator.name=ransac", "estimator.ransac_iterations=300"]
+    method = make_method("geomoe3d", few)
     answers = [method(pair_of(rows, seed=seed)).T_target_source for seed in range(6)]
     assert len({None if T is None else T.tobytes() for T in answers}) > 1
 

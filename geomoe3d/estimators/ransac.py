@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.estimators.base import check_correspondences
-from geomoe3d.geometry.rigid_fit import spread, squared_residuals
-from geomoe3d.types import Hypothesis
+from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
+from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.types import FloatArray, Hypothesis
+
+_MOST_REFITS = 50
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class RansacEstimator:
             ],
             registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
         )
-        T = np.array(answer.transformation, dtype=np.float64)
+        T = _settle(np.array(answer.transformation, dtype=np.float64), rows, inlier_threshold)
         r2 = squared_residuals(T[None, :3, :3], T[None, :3, 3], rows[:, :3], rows[:, 3:])[0]
         num_inliers = int((r2 < inlier_threshold**2).sum())
         # Inliers on a line leave the turn about it free: that is no answer either.
@@ -74,3 +77,20 @@ class RansacEstimator:
             return []
         score = float(np.maximum(1 - r2 / inlier_threshold**2, 0).sum())
         return [Hypothesis(T, score, num_inliers)]
+
+
+def _settle(T: FloatArray, rows: FloatArray, inlier_threshold: float) -> FloatArray:
+    """Least squares on the inliers until they stay the same.
+
+    Where many rows are inliers the library stops early, and which of its threads' good samples it returns
+    depends on their race; from any of them this ends at the same fit.
+    """
+    before = np.zeros(len(rows), dtype=np.bool_)
+    for _ in range(_MOST_REFITS):
+        r2 = squared_residuals(T[None, :3, :3], T[None, :3, 3], rows[:, :3], rows[:, 3:])[0]
+        inlier = r2 < inlier_threshold**2
+        if inlier.sum() < 3 or (inlier == before).all():
+            break
+        R, t = fit_rigid(rows[inlier, :3], rows[inlier, 3:], np.ones(int(inlier.sum())))
+        T, before = make_transform(R, t), inlier
+    return T

@@ -71,6 +71,7 @@ class Chooser:
         self._refiner = Refiner(*described, config.refinement)
         self._ranked: list[tuple[Hypothesis, Evidence]] = []
         self._first: Hypothesis | None = None
+        self._refined: dict[bytes, tuple[FloatArray, str | None, list[Evidence]]] = {}
 
     def consider(self, hypotheses: list[Hypothesis]) -> None:
         """Add a lot of hypotheses, the estimator's best one first."""
@@ -166,10 +167,13 @@ class Chooser:
         The network's ``verdict`` on the motion before holds for the refined one too.
         """
         T_target_source = hypothesis.T_target_source
-        T, note = self._refiner(T_target_source)
-        before, after = (
-            replace(self._verifier.evidence(motion), verdict=verdict) for motion in (T_target_source, T)
-        )
+        key = T_target_source.tobytes()
+        if key not in self._refined:  # a second look often likes what the first one did
+            T, note = self._refiner(T_target_source)
+            evidence = [self._verifier.evidence(motion) for motion in (T_target_source, T)]
+            self._refined[key] = T, note, evidence
+        T, note, evidence = self._refined[key]
+        before, after = (replace(of_motion, verdict=verdict) for of_motion in evidence)
         if after.score < _KEPT_EVIDENCE * before.score:
             note = "refinement made the clouds fit less well; the unrefined motion is given"
             return Refined(T_target_source, before, note, hypothesis)

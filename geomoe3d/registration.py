@@ -38,7 +38,7 @@ from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 if TYPE_CHECKING:
-    from geomoe3d.filters.motion_judge import Judged
+    from geomoe3d.filters.motion_judge import Judged, PairJudge
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Registrar:
         )
         network = getattr(self._filter, "config", None)
         self._wants_ratio = "ratio" in getattr(network, "extra_channels", ())
-        self._judge: Callable[..., list[Judged]] | None = getattr(self._filter, "judge", None)
+        self._judge: Callable[..., PairJudge] | None = getattr(self._filter, "about", None)
         self._estimator: Estimator = make_estimator(self.config.estimator)
 
     @classmethod
@@ -276,7 +276,14 @@ class Registrar:
         judge = self._judge
         if judge is None or not self._shows_motions:
             return None
-        return lambda motions: judge(matched, motions, voxel_size=voxel_size)
+        of_pair: list[PairJudge] = []
+
+        def ask(motions: FloatArray) -> list[Judged]:
+            if not of_pair:  # not before it is needed, and then once
+                of_pair.append(judge(matched, voxel_size=voxel_size))
+            return of_pair[0](motions)
+
+        return ask
 
 
 def register(

@@ -1,21 +1,29 @@
-"""One thread for the many small matrix products of a registration.
+"""Threads: one for each of the many small matrix products of a registration, all there are for its parts.
 
 Products of some hundred rows are over before a second thread has woken up; on a machine whose cores have
-other work, waiting for it made solving four times slower. One thread also gives the same last bits on any
-number of cores. Large products (matching of large clouds) and torch keep theirs.
+other work, waiting for it made solving four times slower. So BLAS keeps to one thread (`single_blas_thread`),
+and work is divided where its parts are independent and large (`each`). Either way the same last bits come
+out on any number of cores. Large products (matching of large clouds) keep the library's threads.
 """
 
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+THREADS_VARIABLE = "OMP_NUM_THREADS"
 
 _lock = threading.Lock()
 _depth = 0
 _limits: Any = None
+_inside = threading.local()
 
 
 @contextmanager
@@ -35,6 +43,54 @@ def single_blas_thread() -> Iterator[None]:
             if _depth == 0:
                 _limits.restore_original_limits()
                 _limits = None
+
+
+def usable_threads() -> int:
+    """``OMP_NUM_THREADS`` where it is a positive number, as in worker processes, else the process's cores."""
+    given = os.environ.get(THREADS_VARIABLE, "").split(",")[0].strip()
+    if given.isdigit() and int(given) > 0:
+        return int(given)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """``[function(item) for item in items]``, several at a time where there are threads for it.
+
+    Results are in order, and the first item's exception in order is raised, as in a loop; but all items are
+    begun. One inside another is a plain loop. Worth it from about a millisecond per item, spent outside the
+    interpreter (numpy, torch).
+    """
+    todo = list(items)
+    threads = 1 if getattr(_inside, "busy", False) else min(usable_threads(), len(todo))
+    if threads < 2:
+        return [function(item) for item in todo]
+    futures: list[Future[Result]] = [Future() for _ in todo]
+    numbers = iter(range(len(todo)))  # shared by the threads: `next` on it is atomic
+
+    def work() -> None:
+        _inside.busy = True
+        try:
+            for number in numbers:
+                try:
+                    futures[number].set_result(function(todo[number]))
+                except BaseException as error:
+                    futures[number].set_exception(error)
+        finally:
+            _inside.busy = False
+
+    pool = _pool(os.getpid(), usable_threads() - 1)
+    for _ in range(threads - 1):
+        pool.submit(work)
+    work()
+    return [future.result() for future in futures]
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    """Helpers that wait for work; a forked process, which has not got them, makes its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="geomoe3d")
 
 
 @lru_cache(maxsize=1)

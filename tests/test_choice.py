@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -78,7 +79,8 @@ def opinions(*liked: np.ndarray):
         shown.extend(motions)
         return [
             Judged(
-                6.0 if any(np.array_equal(m, x) for x in liked) else -6.0, FilterOutput(np.full(3, k + 1.0))
+                6.0 if any(np.array_equal(m, x) for x in liked) else -6.0,
+                partial(FilterOutput, np.full(3, k + 1.0)),
             )
             for k, m in enumerate(motions)
         ]

@@ -25,7 +25,7 @@ from geomoe3d.filters.base import resolve_filter
 from geomoe3d.filters.folded import FoldedGeoMoE
 from geomoe3d.filters.geomoe import PRIOR_KERNEL, GeoMoE
 from geomoe3d.filters.geomoe_filter import GeoMoEFilter
-from geomoe3d.filters.inputs import collate, motion_inputs, pair_input
+from geomoe3d.filters.inputs import MotionInputs, collate, pair_input
 from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
 from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
@@ -133,7 +133,7 @@ def network(**changes: object) -> GeoMoE:
     torch.manual_seed(0)
     model = GeoMoE(build_config(NetworkConfig, {**SMALL, **changes})).train()
     rows, T = scene()
-    batch = collate(motion_inputs(rows, T[None].repeat(3, 0), (None, None), VOXEL, model.config))
+    batch = collate(MotionInputs(rows, (None, None), VOXEL, model.config).under(T[None].repeat(3, 0)))
     model(batch.coordinates, batch.channels, batch.neighbors)
     return model.eval()
 
@@ -142,7 +142,7 @@ def network(**changes: object) -> GeoMoE:
 def test_folded_network_gives_the_same_verdict(changes: dict[str, object]) -> None:
     model = network(**changes)
     rows, T = scene(1)
-    inputs = motion_inputs(rows, np.stack([T, np.eye(4)]), AT_ZERO, VOXEL, model.config)
+    inputs = MotionInputs(rows, AT_ZERO, VOXEL, model.config).under(np.stack([T, np.eye(4)]))
     batch = collate(inputs)
     with torch.no_grad():
         plain = model(batch.coordinates, batch.channels, batch.neighbors)
@@ -153,12 +153,21 @@ def test_folded_network_gives_the_same_verdict(changes: dict[str, object]) -> No
         assert found.verdict is not None
         torch.testing.assert_close(found.verdict, plain.verdict[k], atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(found.logits, plain.logits[:, k], atol=1e-4, rtol=1e-4)
+    channels = batch.channels
+    several = folded.under_motions(inputs[0].coordinates, channels, inputs[0].neighbors, insight=True)
+    for k, found in enumerate(several):
+        alone = folded(inputs[k].coordinates, inputs[k].channels, inputs[k].neighbors, insight=True)
+        torch.testing.assert_close(found.verdict, alone.verdict, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(found.logits, alone.logits, atol=1e-4, rtol=1e-4)
+        assert found.sub_field is not None
+        assert alone.sub_field is not None
+        assert (found.sub_field == alone.sub_field).float().mean() > 0.99
 
 
 def test_padding_changes_no_verdict() -> None:
     model = network()
     short, long = scene(1, 200), scene(2, 300)
-    inputs = [motion_inputs(rows, T[None], AT_ZERO, VOXEL, model.config)[0] for rows, T in (short, long)]
+    inputs = [MotionInputs(rows, AT_ZERO, VOXEL, model.config).under(T[None])[0] for rows, T in (short, long)]
     both, alone = collate(inputs), collate(inputs[:1])
     assert both.mask is not None
     with torch.no_grad():
@@ -317,7 +326,38 @@ def test_more_rows_than_are_judged_are_all_weighed_wherever_they_stand() -> None
 def test_no_motions_are_no_channels() -> None:
     rows, _ = scene()
     assert aligned(rows, np.zeros((0, 4, 4))).shape == (0, 300, len(CHANNELS))
-    assert MotionJudge(network()).judge(Correspondences(rows), np.zeros((0, 4, 4)), voxel_size=VOXEL) == []
+    assert MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)(np.zeros((0, 4, 4))) == []
+
+
+def test_a_judge_stops_where_it_has_seen_enough() -> None:
+    rows, T = scene(3)
+    motions = np.stack([T @ turned(k) for k in (0, 90, 180, 30, 60)])
+    judge = MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)
+    every = [j.verdict for j in judge(motions)]
+    assert len(every) == 5
+    assert [j.verdict for j in judge(motions, max(every) + 1)] == pytest.approx(every, abs=1e-4)
+    assert [j.verdict for j in judge(motions, min(every) - 1)] == pytest.approx(every[:2], abs=1e-4)
+
+
+def test_verdicts_are_the_same_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, T = scene(3)
+    motions = np.stack([T @ turned(k) for k in range(0, 180, 25)])
+    found = []
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        found.append(
+            [
+                j.verdict
+                for j in MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)(motions)
+            ]
+        )
+    assert found[0] == found[1] == found[2]
+
+
+def turned(degrees: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return T
 
 
 def test_one_thread_is_the_callers_own_and_ends() -> None:

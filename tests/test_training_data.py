@@ -97,6 +97,27 @@ def test_impossible_settings_are_refused() -> None:
             build_config(SyntheticConfig, tree)
 
 
+def test_a_bend_is_smooth_small_and_keeps_equal_points_equal() -> None:
+    rng = np.random.default_rng(3)
+    rows = rng.uniform(-3, 3, (400, 6)).astype(np.float32)
+    rows[200:, 3:] = rows[:200, 3:]
+    pair = TrainingPair(rows, np.ones(400, dtype=bool), np.eye(4), 0.05)
+    config = AugmentationConfig(rotate=False, swap=0, jitter=0, bend=1.5)
+    shifts = []
+    for seed in range(20):
+        bent = augment(pair, config, None, np.random.default_rng(seed)).correspondences
+        assert (bent[200:, 3:] == bent[:200, 3:]).all()
+        shift = bent - rows
+        shifts.append(np.linalg.norm(shift[:, :3], axis=1).max())
+        apart = np.linalg.norm(rows[:, None, :3] - rows[None, :, :3], axis=2)
+        change = np.linalg.norm(shift[:, None, :3] - shift[None, :, :3], axis=2)
+        # Three waves of at least 1.5 m, amplitudes 1.5 voxels over sqrt(3) each: close points move together.
+        assert (change <= np.sqrt(3) * 0.075 * 2 * np.pi / 1.5 * apart + 1e-5).all()
+    assert 0.3 * 0.075 < max(shifts) <= 0.075 * np.sqrt(3)
+    plain = augment(pair, AugmentationConfig(rotate=False, swap=0, jitter=0), None, np.random.default_rng(0))
+    assert (plain.correspondences == rows).all()
+
+
 def test_augmentation_keeps_labels_true_and_rows_together() -> None:
     pair = SyntheticPairs(SyntheticConfig(voxel_size=(0.1, 0.1)))[0]
     tagged = TrainingPair(

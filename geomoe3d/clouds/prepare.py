@@ -12,6 +12,7 @@ import numpy as np
 from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
+from geomoe3d.threads import each, usable_threads
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _AUTO_SAMPLE = 100_000  # points looked at when a voxel size is chosen: density is known well enough by then
@@ -84,9 +85,11 @@ def choose_voxel_size(source: PointCloud, target: PointCloud, num_points: int) -
 
     Both clouds must have passed `check_cloud`.
     """
-    by_count = max(_size_for_count(c.points, num_points) for c in (source, target))
-    by_spacing = 2.0 * max(typical_spacing(c.points) for c in (source, target))
-    return float(f"{max(by_count, by_spacing):.2g}")
+
+    def of(cloud: PointCloud) -> float:
+        return max(_size_for_count(cloud.points, num_points), 2.0 * typical_spacing(cloud.points))
+
+    return float(f"{max(each(of, (source, target))):.2g}")
 
 
 def check_cloud(cloud: PointCloud) -> None:
@@ -231,7 +234,9 @@ def drop_isolated(points: FloatArray, radius: float) -> FloatArray:
     while len(points) >= 3:
         # Beyond the bound nothing is sought; a tree that is not balanced is built in a third of the time.
         tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        distances, _ = tree.query(points, k=3, distance_upper_bound=np.nextafter(radius, np.inf))
+        distances, _ = tree.query(
+            points, k=3, distance_upper_bound=np.nextafter(radius, np.inf), workers=usable_threads()
+        )
         close = np.asarray(distances)[:, 2] <= radius
         if close.all():
             return points

@@ -12,7 +12,7 @@ the score is a smooth function of the residual; every seed is scored on all corr
 distinct hypotheses are kept for a later choice on the clouds.
 
 Place: solve. Cost for N correspondences, M seeds and W witnesses: O(N^2) memory (4 bytes each, N at most
-``max_dense``), M N W multiply-adds; 1,000 take some 25 ms on one core.
+``max_dense``), M N W multiply-adds; 1,000 take some 30 ms on one core, 20 on two.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ from numpy.typing import ArrayLike
 from geomoe3d.estimators.base import check_correspondences
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.threads import single_blas_thread
+from geomoe3d.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, IntArray
+
+_BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
+_SCORED_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class ConsensusEstimator:
     """
 
     num_hypotheses: int = 8
-    num_seeds: int = 1000
+    num_seeds: int = 700
     set_sizes: tuple[int, ...] = (3, 6)
     length_tolerance: float = 0.8
     num_witnesses: int = 300
@@ -81,20 +84,14 @@ class ConsensusEstimator:
         source, target = np.ascontiguousarray(unit[:, :3]), np.ascontiguousarray(unit[:, 3:])
         # Multiples of 1/1024 add up exactly in float32, in whatever order the threads do it.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
-        R, t = self._propose(source, target, vote, self._dense_rows(given, seed))
-        R, t = self._keep_distinct(
-            R, t, score(R, t, source, target, vote), max(self.num_refined, self.num_hypotheses)
-        )
+        R, t, scores = self._propose(source, target, vote, self._dense_rows(given, seed))
+        keep = self._distinct_rows(R, t, scores, max(self.num_refined, self.num_hypotheses))
+        R, t = R[keep], t[keep]
         for _ in range(self.num_refits):
             R, t = refit(R, t, source, target, vote)
         scores = score(R, t, source, target, vote)
-        order = self._distinct_rows(R, t, scores, self.num_hypotheses)
-        found = []
-        for k in order:
-            hypothesis = self._finish(R[k], t[k], float(scores[k]), rows, centre, vote, inlier_threshold)
-            if hypothesis is not None:
-                found.append(hypothesis)
-        return found
+        best = self._distinct_rows(R, t, scores, self.num_hypotheses)
+        return _finished(R[best], t[best], scores[best], rows, centre, vote, inlier_threshold)
 
     def _dense_rows(self, given: FloatArray, seed: int) -> IntArray:
         """Rows that take part in proposing, at most ``max_dense``: the heaviest, ties by seeded choice."""
@@ -106,25 +103,23 @@ class ConsensusEstimator:
 
     def _propose(
         self, source: Float32Array, target: Float32Array, vote: Float32Array, rows: IntArray
-    ) -> tuple[Floats, Floats]:
-        """One motion per seed and size of its local set: R (S M, 3, 3), t (S M, 3)."""
+    ) -> tuple[Floats, Floats, Float32Array]:
+        """One motion per seed and size of its local set: R (K, 3, 3), t (K, 3), and their scores (K,)."""
         p, q, v = source[rows], target[rows], vote[rows]
-        source_distance = distances(p, p)
-        compatible = compatibility(source_distance, distances(q, q), self.length_tolerance)
+        source_distance, compatible = compatibility(p, q, self.length_tolerance)
         support = compatible @ v
         seeds = choose_seeds(support, source_distance, self.num_seeds)
         witnesses = np.sort(choose_seeds(support, source_distance, self.num_witnesses))
-        members, weights = local_sets(compatible, seeds, v, max(self.set_sizes), witnesses)
-        fits = [
-            fit_rigid(p[some], q[some], weights[:, : size + 1])
-            for size in self.set_sizes
-            for some in (members[:, : size + 1],)
-        ]
-        return np.concatenate([R for R, _ in fits]), np.concatenate([t for _, t in fits])
 
-    def _keep_distinct(self, R: Floats, t: Floats, scores: Floats, limit: int) -> tuple[Floats, Floats]:
-        keep = self._distinct_rows(R, t, scores, limit)
-        return R[keep], t[keep]
+        def of(some: IntArray) -> tuple[Floats, Floats, Float32Array]:
+            members, weights = local_sets(compatible, some, v, max(self.set_sizes), witnesses)
+            sets = [(members[:, : size + 1], weights[:, : size + 1]) for size in self.set_sizes]
+            fits = [fit_rigid(p[rows], q[rows], weight) for rows, weight in sets]
+            R, t = (np.concatenate(part) for part in zip(*fits, strict=True))
+            return R, t, score(R, t, source, target, vote)
+
+        R, t, scores = (np.concatenate(part) for part in zip(*each(of, _blocks(seeds)), strict=True))
+        return R, t, scores
 
     def _distinct_rows(self, R: Floats, t: Floats, scores: Floats, limit: int) -> list[int]:
         """Greedy choice by score; each pick takes all motions close to it out of the race."""
@@ -142,30 +137,37 @@ class ConsensusEstimator:
             left = left[~same]
         return keep
 
-    def _finish(
-        self,
-        R: Floats,
-        t: Floats,
-        score_value: float,
-        rows: FloatArray,
-        centre: FloatArray,
-        vote: Float32Array,
-        inlier_threshold: float,
-    ) -> Hypothesis | None:
-        """A last fit in float64 on the inliers; None where they do not determine a motion."""
-        centred = rows - centre
-        R64: Floats = R.astype(np.float64)
-        t64: Floats = t.astype(np.float64) * inlier_threshold
-        r2 = squared_residuals(R64[None], t64[None], centred[:, :3], centred[:, 3:])[0] / inlier_threshold**2
-        w = vote * (r2 < 1) / (1 + r2)
-        # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
-        thinnest = min(spread(centred[:, :3], w), spread(centred[:, 3:], w))
-        if (w > 0).sum() < 3 or thinnest < 0.05 * inlier_threshold:
-            return None
-        R64, t64 = fit_rigid(centred[:, :3], centred[:, 3:], w)
-        r2 = squared_residuals(R64[None], t64[None], centred[:, :3], centred[:, 3:])[0] / inlier_threshold**2
-        T = make_transform(R64, t64 + centre[3:] - R64 @ centre[:3])
-        return Hypothesis(T, score_value, int((r2 < 1).sum()))
+
+def _finished(
+    R: Floats,
+    t: Floats,
+    scores: Float32Array,
+    rows: FloatArray,
+    centre: FloatArray,
+    vote: Float32Array,
+    inlier_threshold: float,
+) -> list[Hypothesis]:
+    """A last fit in float64 on the inliers of each motion, in order; those without enough are left out.
+
+    R (K, 3, 3), t (K, 3) in inlier thresholds about ``centre``; rows (N, 6) as they came.
+    """
+    source, target = (rows - centre)[:, :3], (rows - centre)[:, 3:]
+    R64: Floats = R.astype(np.float64)
+    t64: Floats = t.astype(np.float64) * inlier_threshold
+    r2 = squared_residuals(R64, t64, source, target) / inlier_threshold**2
+    weights = vote * (r2 < 1) / (1 + r2)
+    # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
+    thinnest = np.minimum(spread(source, weights), spread(target, weights))
+    firm = ((weights > 0).sum(1) >= 3) & (thinnest >= 0.05 * inlier_threshold)
+    if not firm.any():
+        return []
+    R64, t64 = fit_rigid_shared(source, target, weights[firm])
+    r2 = squared_residuals(R64, t64, source, target) / inlier_threshold**2
+    shift = t64 + centre[3:] - np.einsum("kij,j->ki", R64, centre[:3])
+    return [
+        Hypothesis(make_transform(*motion), float(score_value), int(count))
+        for *motion, score_value, count in zip(R64, shift, scores[firm], (r2 < 1).sum(1), strict=True)
+    ]
 
 
 def bundle_weights(target: FloatArray) -> Float32Array:
@@ -187,17 +189,30 @@ def distances(a: Float32Array, b: Float32Array) -> Float32Array:
 
 
 def compatibility(
-    source_distance: Float32Array, target_distance: Float32Array, tolerance: float = 1.0
-) -> Float32Array:
-    """1 where two correspondences preserve length to within ``tolerance``, else 0; zero diagonal.
+    source: Float32Array, target: Float32Array, tolerance: float = 1.0
+) -> tuple[Float32Array, Float32Array]:
+    """Distances of the source points (N, N), and 1 where two correspondences preserve length, else 0.
 
-    Both distances (N, N) in inlier thresholds, as the tolerance; ``target_distance`` is overwritten.
+    Points (N, 3) in inlier thresholds, as the tolerance; the diagonal of the second (N, N) is zero.
     """
-    target_distance -= source_distance
-    np.abs(target_distance, out=target_distance)
-    compatible = (target_distance < tolerance).astype(np.float32)
+    apart = np.empty((len(source), len(source)), dtype=np.float32)
+    compatible = np.empty_like(apart)
+
+    def fill(some: IntArray) -> None:
+        block = slice(some[0], some[-1] + 1)
+        apart[block] = distances(source[block], source)
+        gap = distances(target[block], target)
+        gap -= apart[block]
+        np.less(np.abs(gap, out=gap), tolerance, out=compatible[block], casting="unsafe")
+
+    each(fill, _blocks(np.arange(len(source))))
     np.fill_diagonal(compatible, 0)
-    return compatible
+    return apart, compatible
+
+
+def _blocks(rows: IntArray) -> list[IntArray]:
+    """Rows in parts of at most `_BLOCK`, the same ones for any number of threads."""
+    return [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
 
 
 def choose_seeds(support: Float32Array, source_distance: Float32Array, limit: int) -> IntArray:
@@ -250,7 +265,7 @@ def score(R: Floats, t: Floats, source: Float32Array, target: Float32Array, vote
     told right from wrong better than a count or a truncated square.
     """
     scores = np.empty(len(R), dtype=np.float32)
-    step = max(1, 2_000_000 // max(len(source), 1))
+    step = max(1, _SCORED_AT_ONCE // max(len(source), 1))
     for start in range(0, len(R), step):
         part = slice(start, start + step)
         kernel = squared_residuals(R[part], t[part], source, target)

@@ -12,7 +12,9 @@ Cost: about 10 ms, and 1 ms per motion, for 1,000 correspondences.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.estimators.consensus import bundle_weights, distances
+from geomoe3d.threads import each
 from geomoe3d.types import Float32Array, FloatArray, IntArray
 
 CHANNELS = (
@@ -46,6 +49,7 @@ NUM_CHANNELS = len(CHANNELS)
 _NORMAL_NEIGHBORS = 10
 _PIXEL_DEG = 5.0  # keypoints are sparse: finer pixels would stay empty
 _MOST_ANCHORS = 1000
+_ROWS_AT_ONCE = 250
 _REACH = 3.0  # inlier thresholds in which a surface point of the other scan is sought
 
 
@@ -74,7 +78,7 @@ class Surface:
         """Normals by a plane through the nearest points."""
         from scipy.spatial import cKDTree
 
-        tree = cKDTree(points)
+        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
         k = min(_NORMAL_NEIGHBORS, len(points))
         _, near = tree.query(points, k=k)
         patch = points[np.asarray(near).reshape(len(points), k)]
@@ -108,19 +112,20 @@ class AlignedChannels:
         rows = correspondences / inlier_threshold
         self._threshold = inlier_threshold
         self.rows = rows
-        sides = []
-        for half, viewpoint in zip((rows[:, :3], rows[:, 3:]), viewpoints, strict=True):
-            points, index = np.unique(half, axis=0, return_inverse=True)
-            place = None if viewpoint is None else viewpoint / inlier_threshold
-            sides.append((Surface.of(points, place), index.ravel()))
-        (self.source, self._source_row), (self.target, self._target_row) = sides
-        self._fixed = self._constant_channels()
 
-    def _constant_channels(self) -> dict[str, NDArray[Any]]:
-        found: dict[str, NDArray[Any]] = {
-            "vote": bundle_weights(self.rows[:, 3:]),
-            "degree": _degree(self.rows),
-        }
+        def side(number: int) -> tuple[Surface, IntArray]:
+            points, index = np.unique(rows[:, 3 * number : 3 * number + 3], axis=0, return_inverse=True)
+            viewpoint = viewpoints[number]
+            place = None if viewpoint is None else viewpoint / inlier_threshold
+            return Surface.of(points, place), index.ravel()
+
+        jobs: list[Any] = [partial(side, 0), partial(side, 1), *_degree_jobs(rows)]
+        first, second, *degree = each(lambda job: job(), jobs)
+        (self.source, self._source_row), (self.target, self._target_row) = first, second
+        self._fixed = self._constant_channels(np.concatenate(degree))
+
+    def _constant_channels(self, degree: Float32Array) -> dict[str, NDArray[Any]]:
+        found: dict[str, NDArray[Any]] = {"vote": bundle_weights(self.rows[:, 3:]), "degree": degree}
         for name, surface, row in (
             ("source", self.source, self._source_row),
             ("target", self.target, self._target_row),
@@ -166,15 +171,21 @@ class AlignedChannels:
         return out
 
 
-def _degree(rows: FloatArray) -> Float32Array:
-    """(N,) 5 x the share of at most 1,000 of the correspondences with which each one preserves length."""
+def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
+    """Parts of (N,): 5 x the share of at most 1,000 correspondences with which each one preserves length."""
     unit = (rows - rows.mean(0)).astype(np.float32)
     anchors = unit[:: -(-len(unit) // _MOST_ANCHORS)]
-    gap = distances(unit[:, :3], anchors[:, :3])
-    gap -= distances(unit[:, 3:], anchors[:, 3:])
-    compatible = np.abs(gap, out=gap) < 1.0
-    share: Float32Array = (5 * (compatible.sum(1) - 1) / len(anchors)).astype(np.float32)
-    return share
+
+    def part(some: Float32Array) -> Float32Array:
+        gap = distances(some[:, :3], anchors[:, :3])
+        gap -= distances(some[:, 3:], anchors[:, 3:])
+        compatible = np.abs(gap, out=gap) < 1.0
+        share: Float32Array = (5 * (compatible.sum(1) - 1) / len(anchors)).astype(np.float32)
+        return share
+
+    return [
+        partial(part, unit[start : start + _ROWS_AT_ONCE]) for start in range(0, len(unit), _ROWS_AT_ONCE)
+    ]
 
 
 def _kernel(square: FloatArray) -> FloatArray:

@@ -1,9 +1,10 @@
-"""The same GeoMoE, faster, for one pair at a time: norms and projections folded into fewer products.
+"""The same GeoMoE, faster, for one pair under one or several motions: norms and projections folded.
 
 In evaluation batch norms are affine maps and disappear into their neighbours. In both attentions between
 N correspondences and M sub-fields the N side is never projected: queries, keys and values of the M side are
 multiplied into the weights first, so per layer only six products run over all correspondences. Constants
 that a softmax cancels are dropped. Logits agree with `GeoMoE` to 1e-4; tests hold it to that. Linear in N.
+Several motions at a time cost less than one after the other where threads share an interpreter.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from geomoe3d.filters.folded_blocks import (
     FoldedUpdate,
     affine,
     norm_relu,
+    product,
     scale_relu,
     scale_shift,
     two_layer,
@@ -34,6 +36,8 @@ from geomoe3d.filters.layers import (
     motion,
     weights_from_logits,
 )
+
+_REJECTED = -1e9
 
 
 class FoldedOutput(NamedTuple):
@@ -66,7 +70,6 @@ class FoldedGeoMoE:
             self._layers = [_Layer(layer) for layer in model.layers if isinstance(layer, GeoMoELayer)]
             self._verdict = None if model.verdict is None else copy.deepcopy(model.verdict)
 
-    @torch.inference_mode()
     def __call__(
         self, coordinates: Tensor, channels: Tensor | None, neighbors: Tensor, *, insight: bool = False
     ) -> FoldedOutput:
@@ -78,21 +81,38 @@ class FoldedGeoMoE:
             neighbors: (N, K) int64.
             insight: also say which sub-field and expert each correspondence belongs to.
         """
+        channels = None if channels is None else channels[None]
+        return self.under_motions(coordinates, channels, neighbors, insight=insight)[0]
+
+    @torch.inference_mode()
+    def under_motions(
+        self, coordinates: Tensor, channels: Tensor | None, neighbors: Tensor, *, insight: bool = False
+    ) -> list[FoldedOutput]:
+        """Weigh one pair under each of B motions, whose channels are (B, N, C); the rest as for one."""
         index = neighbors.t().reshape(-1)
         field = self._initialise(coordinates, channels)
         together = None if self._verdict is None else together_under_motion(channels)
         logits: Tensor | None = None if together is None else together - PRIOR_KERNEL
-        verdicts = []
+        of_layers = []
         attention = expert = None
         for layer in self._layers:
             field, logits, attention, expert = layer(field, logits, index)
-            verdicts.append(logits)
-        stacked, verdict = torch.stack(verdicts), None
+            of_layers.append(logits)
+        stacked = torch.stack(of_layers, dim=1)
+        verdict = sub_field = None
         if self._verdict is not None and channels is not None and together is not None:
-            verdict = self._verdict(channels[None], field[None], together[None], None)[0]
-        if not insight or attention is None:
-            return FoldedOutput(stacked, None, None, verdict)
-        return FoldedOutput(stacked, attention.mean(dim=0).argmax(dim=0), expert, verdict)
+            verdict = self._verdict(channels, field, together, None)
+        if insight and attention is not None:
+            sub_field = attention.mean(dim=1).argmax(dim=1)
+        return [
+            FoldedOutput(
+                stacked[k],
+                None if sub_field is None else sub_field[k],
+                None if sub_field is None or expert is None else expert[k],
+                None if verdict is None else verdict[k],
+            )
+            for k in range(len(stacked))
+        ]
 
 
 class _Initialise:
@@ -107,14 +127,17 @@ class _Initialise:
         self.linear2 = affine(block.linear2)
 
     def __call__(self, coordinates: Tensor, channels: Tensor | None) -> Tensor:
-        inputs = [] if self.motion_form == "none" else [motion(coordinates, self.motion_form)]
+        """(N, 2d) and (B, N, C) to the field (B, width, N)."""
+        num = 1 if channels is None else len(channels)
+        inputs = (
+            [] if self.motion_form == "none" else [motion(coordinates, self.motion_form).expand(num, -1, -1)]
+        )
         if channels is not None:
             inputs.append(channels)
-        x = torch.addmm(self.bias, self.weight, torch.cat(inputs, dim=1).t())
+        x = product(self.weight, torch.cat(inputs, dim=2).transpose(1, 2), self.bias)
         h = norm_relu(x, self.norm1) if self.leading else scale_relu(x, self.norm1)
-        h = torch.addmm(self.linear1[1], self.linear1[0], h)
-        h = norm_relu(h, self.norm2)
-        return x.add_(self.linear2[1]).addmm_(self.linear2[0], h)
+        h = norm_relu(product(self.linear1[0], h, self.linear1[1]), self.norm2)
+        return x.add_(product(self.linear2[0], h, self.linear2[1]))
 
 
 class _Layer:
@@ -135,17 +158,17 @@ class _Layer:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         if self.context is not None:
             field = self.context(field, index)
-        weights = torch.mm(self.pool_weight, norm_relu(field, self.pool_norm)).softmax(dim=1)
-        z, _ = self.experts(torch.mm(field, weights.t()))
+        weights = product(self.pool_weight, norm_relu(field, self.pool_norm)).softmax(dim=2)
+        z, _ = self.experts(torch.bmm(field, weights.transpose(1, 2)))
         z, routing = self.rectify(self.gather(z, field, logits))
         field, attention = self.rebuild(field, z)
         h = scale_relu(field, self.predict_norm)
-        verdict = torch.addmm(self.predict[1], self.predict[0], h)[0]
-        return field, verdict, attention, routing
+        logits = product(self.predict[0], h, self.predict[1])[:, 0]
+        return field, logits, attention, routing
 
 
 class _Context:
-    """Local context on (d', K, N): channels are mixed as (d', K N), neighbours as d' products (K, N)."""
+    """Local context on (B, d', K, N): channels are mixed as (d', K N), neighbours as d' products (K, N)."""
 
     def __init__(self, module: LocalOrthogonalContext) -> None:
         self.residual = module.residual
@@ -156,26 +179,25 @@ class _Context:
         self.restore, self.restore_bias = affine(module.restore)
 
     def __call__(self, field: Tensor, index: Tensor) -> Tensor:
-        f = torch.mm(self.reduce, field)
-        width, num = f.shape
-        h = torch.sub(f[:, None], f.index_select(1, index).view(width, -1, num)).view(width, -1)
+        f = product(self.reduce, field)
+        num, width, rows = f.shape
+        f = f.view(num * width, rows)  # in two dimensions the selection is twenty times faster
+        h = torch.sub(f[:, None], f.index_select(1, index).view(num * width, -1, rows)).view(num, width, -1)
         a, a_bias, b, b_bias = self.channels
-        mixed = torch.addmm(a_bias, a, h).relu_()
-        h = h.add_(b_bias).addmm_(b, mixed)
-        g = h.view(width, -1, num)
+        mixed = product(a, h, a_bias).relu_()
+        h = h.add_(b_bias).baddbmm_(b.expand(num, -1, -1), mixed)
+        g = h.view(num * width, -1, rows)
         a, a_bias, b, b_bias = self.neighbors
-        mixed = torch.baddbmm(a_bias, a.expand(width, -1, -1), g).relu_()
-        g = g.add_(b_bias).baddbmm_(b.expand(width, -1, -1), mixed)
+        mixed = product(a, g, a_bias).relu_()
+        g = g.add_(b_bias).baddbmm_(b.expand(num * width, -1, -1), mixed)
         a, a_bias, b, b_bias = self.collapse
-        mixed = torch.baddbmm(a_bias, a.expand(width, -1, -1), g).relu_()
-        c = torch.baddbmm(b_bias, b.expand(width, -1, -1), mixed)[:, 0]
-        if self.residual:
-            return field.add_(self.restore_bias).addmm_(self.restore, c)
-        return torch.addmm(self.restore_bias, self.restore, c)
+        c = product(b, product(a, g, a_bias).relu_(), b_bias).view(num, width, rows)
+        change = product(self.restore, c, self.restore_bias)
+        return field.add_(change) if self.residual else change
 
 
 class _Gather:
-    """Sub-fields attend to the correspondences that the prior keeps; the others are not even touched."""
+    """Sub-fields attend to the correspondences that the prior keeps."""
 
     def __init__(self, module: PriorGuidedDecomposition) -> None:
         block = module.gather
@@ -191,22 +213,18 @@ class _Gather:
         self.update = FoldedUpdate(block, value_bias)
 
     def __call__(self, z: Tensor, field: Tensor, logits: Tensor | None) -> Tensor:
-        width, num_fields = z.shape
+        num, _, num_fields = z.shape
         if logits is not None and self.prior == "soft":
-            field = field * weights_from_logits(logits)
-        elif logits is not None and self.prior == "mask":
-            kept = (logits > 0).nonzero()[:, 0]
-            if len(kept) == 0:  # all rejected: uniform attention
-                return self.update(
-                    z, (self.value.view(-1, width) @ field.mean(1, True)).expand(-1, num_fields)
-                )
-            if len(kept) < field.shape[1]:
-                field = field.index_select(1, kept)
-        q = torch.addmm(self.query_bias, self.query, z).view(self.heads, -1, num_fields)
-        into = torch.bmm(q.transpose(1, 2), self.key).view(-1, width)
-        attention = torch.mm(into, field).softmax(dim=1)
-        gathered = torch.mm(attention, field.t()).view(self.heads, num_fields, width)
-        return self.update(z, torch.bmm(self.value, gathered.transpose(1, 2)).view(width, num_fields))
+            field = field * weights_from_logits(logits)[:, None]
+        q = product(self.query, z, self.query_bias).view(num, self.heads, -1, num_fields)
+        into = torch.matmul(q.transpose(2, 3), self.key).view(num, self.heads * num_fields, -1)
+        scores = torch.bmm(into, field)
+        if logits is not None and self.prior == "mask":
+            # Finite, so that attention is uniform where all are rejected.
+            scores.masked_fill_((logits <= 0)[:, None], _REJECTED)
+        gathered = torch.bmm(scores.softmax(dim=2), field.transpose(1, 2))
+        gathered = gathered.view(num, self.heads, num_fields, -1)
+        return self.update(z, torch.matmul(self.value, gathered.transpose(2, 3)).view(z.shape))
 
 
 class _Rebuild:
@@ -229,15 +247,16 @@ class _Rebuild:
         self.bias = first_bias + first[:, width:] @ message_bias
 
     def __call__(self, field: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        width, num_fields = z.shape
-        key_value = torch.mm(self.key_value, z)
-        k = key_value[:width].view(self.heads, -1, num_fields)
-        v = (key_value[width:] + self.value_bias).view(self.heads, -1, num_fields)
-        into = torch.matmul(k.transpose(1, 2), self.query).view(-1, width)
-        bias = torch.matmul(k.transpose(1, 2), self.query_bias).view(-1, 1)
-        num = field.shape[1]
-        attention = torch.addmm(bias, into, field).view(self.heads, num_fields, num).softmax(dim=1)
-        back = torch.matmul(self.from_heads, v).transpose(0, 1).reshape(-1, self.heads * num_fields)
-        hidden = torch.addmm(self.bias, self.own, field)
-        hidden.addmm_(back, attention.view(-1, num)).relu_()
-        return torch.addmm(field, self.second, hidden).add_(self.second_bias), attention
+        """The field (B, width, N) rebuilt from z (B, width, M), and the attention (B, heads, M, N)."""
+        num, width, num_fields = z.shape
+        key_value = product(self.key_value, z)
+        k = key_value[:, :width].reshape(num, self.heads, -1, num_fields).transpose(2, 3)
+        v = (key_value[:, width:] + self.value_bias).view(num, self.heads, -1, num_fields)
+        into = torch.matmul(k, self.query).view(num, self.heads * num_fields, -1)
+        bias = torch.matmul(k, self.query_bias).view(num, self.heads * num_fields, 1)
+        scores = torch.baddbmm(bias, into, field).view(num, self.heads, num_fields, -1)
+        attention = scores.softmax(dim=2)
+        back = torch.matmul(self.from_heads, v).transpose(1, 2).reshape(num, -1, self.heads * num_fields)
+        hidden = product(self.own, field, self.bias)
+        hidden.baddbmm_(back, attention.view(num, self.heads * num_fields, -1)).relu_()
+        return product(self.second, hidden, self.second_bias).add_(field), attention

@@ -1,7 +1,6 @@
 """Folded parts of GeoMoE that see only the M sub-fields, and how norms are folded into weights.
 
-Used by `geomoe3d.filters.folded`; everything here works on single pairs, (C, M) or (C, N), and costs the
-same for any number of correspondences.
+Used by `geomoe3d.filters.folded`; everything here works on one pair under B motions, (B, C, M) or (B, C, N).
 """
 
 from __future__ import annotations
@@ -36,15 +35,21 @@ def two_layer(module: TwoLayer) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return (weight * scale, bias * scale + shift, *affine(module.linear2))
 
 
+def product(weight: Tensor, x: Tensor, bias: Tensor | None = None) -> Tensor:
+    """weight (O, C) times every x (B, C, N), plus bias (O, 1)."""
+    weight = weight.expand(len(x), -1, -1)
+    return torch.bmm(weight, x) if bias is None else torch.baddbmm(bias, weight, x)
+
+
 def scale_relu(x: Tensor, norm: tuple[Tensor, Tensor]) -> Tensor:
     """ReLU of a batch norm."""
     return torch.addcmul(norm[1], x, norm[0]).relu_()
 
 
 def norm_relu(x: Tensor, norm: tuple[Tensor, Tensor]) -> Tensor:
-    """ReLU of batch norm of context norm, in place on a centred copy."""
-    centred = x - x.mean(dim=1, keepdim=True)
-    variance = torch.linalg.vecdot(centred, centred)[:, None] / x.shape[1]
+    """ReLU of batch norm of context norm over the last axis, in place on a centred copy."""
+    centred = x - x.mean(dim=-1, keepdim=True)
+    variance = torch.linalg.vecdot(centred, centred)[..., None] / x.shape[-1]
     scale = norm[0] * torch.rsqrt(variance + ContextNorm.eps)
     return centred.mul_(scale).add_(norm[1]).relu_()
 
@@ -64,11 +69,12 @@ class FoldedAmong:
         self.update = FoldedUpdate(block, value_bias)
 
     def __call__(self, z: Tensor) -> Tensor:
-        """Sub-fields (C, M) to the same shape."""
-        width, num_fields = z.shape
-        q, k, v = torch.addmm(self.all_bias, self.all, z).view(3, self.heads, -1, num_fields)
+        """Sub-fields (B, C, M) to the same shape."""
+        num, _, num_fields = z.shape
+        parts = product(self.all, z, self.all_bias).view(num, 3, self.heads, -1, num_fields)
+        q, k, v = (part.reshape(num * self.heads, -1, num_fields) for part in parts.unbind(1))
         attention = torch.bmm(q.transpose(1, 2), k).softmax(dim=2)
-        return self.update(z, torch.bmm(v, attention.transpose(1, 2)).view(width, num_fields))
+        return self.update(z, torch.bmm(v, attention.transpose(1, 2)).view(z.shape))
 
 
 class FoldedUpdate:
@@ -88,9 +94,9 @@ class FoldedUpdate:
         self.bias = first_bias + first[:, width:] @ (message_bias + message @ value_bias)
 
     def __call__(self, a: Tensor, heads: Tensor) -> Tensor:
-        """Both (C, M) to the updated a."""
-        hidden = torch.addmm(self.bias, self.own, a).addmm_(self.heads, heads).relu_()
-        return torch.addmm(a, self.second, hidden).add_(self.second_bias)
+        """Both (B, C, M) to the updated a."""
+        hidden = product(self.own, a, self.bias).add_(product(self.heads, heads)).relu_()
+        return product(self.second, hidden, self.second_bias).add_(a)
 
 
 class FoldedRectifier:
@@ -107,17 +113,17 @@ class FoldedRectifier:
         self.experts = FoldedExperts(module.experts)
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Sub-fields (C, M) rectified, and the main expert of each."""
+        """Sub-fields (B, C, M) rectified, and the main expert (B, M) of each."""
         paths = []
         if self.gain:
             (a, a_bias), (b, b_bias) = self.gain
-            gain = torch.addmm(b_bias, b, torch.addmm(a_bias, a, z.mean(dim=1, keepdim=True)).relu_())
+            gain = product(b, product(a, z.mean(dim=2, keepdim=True), a_bias).relu_(), b_bias)
             paths.append(z * (gain.sigmoid() if self.sigmoid else gain))
         if self.spatial is not None:
             paths.append(self.spatial(z))
         if self.fuse is not None:
             a, a_bias, b, b_bias = self.fuse
-            z = torch.addmm(b_bias, b, torch.addmm(a_bias, a, torch.cat(paths)).relu_())
+            z = product(b, product(a, torch.cat(paths, dim=1), a_bias).relu_(), b_bias)
         return self.experts(z)
 
 
@@ -140,20 +146,20 @@ class FoldedExperts:
             self.down = torch.cat([down, moe.down_bias.detach().t()], dim=1).contiguous()
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The sub-fields after their experts, and the main expert of each."""
+        """The sub-fields (B, C, M) after their experts, and the main expert (B, M) of each."""
         if self.dense is not None:
             a, a_bias, b, b_bias = self.dense
-            change = torch.addmm(b_bias, b, torch.addmm(a_bias, a, z).relu_())
+            change = product(b, product(a, z, a_bias).relu_(), b_bias)
             return (change.add_(z) if self.residual else change), None
         if self.moe is None:
             return z, None
         a, a_bias, b, b_bias = self.router
-        logits = torch.addmm(b_bias, b, torch.addmm(a_bias, a, z).relu_())
+        logits = product(b, product(a, z, a_bias).relu_(), b_bias)
         weights = expert_weights(logits, self.moe.top_k, self.moe.router_order)
-        hidden = torch.addmm(self.up_bias, self.up, z).relu_().view(self.num, self.width, -1)
-        hidden = hidden.mul_(weights[:, None]).view(self.num * self.width, -1)
-        change = torch.mm(self.down, torch.cat([hidden, weights]))
-        return (change.add_(z) if self.residual else change), weights.argmax(dim=0)
+        hidden = product(self.up, z, self.up_bias).relu_().view(len(z), self.num, self.width, -1)
+        hidden = hidden.mul_(weights[:, :, None]).view(len(z), self.num * self.width, -1)
+        change = product(self.down, torch.cat([hidden, weights], dim=1))
+        return (change.add_(z) if self.residual else change), weights.argmax(dim=1)
 
 
 def _gain(module: ChannelPath) -> list[tuple[Tensor, Tensor]]:

@@ -134,8 +134,17 @@ def finite_rows(correspondences: Correspondences) -> tuple[IntArray, Corresponde
 
 def run(network: FoldedGeoMoE, inputs: PairInput, device: torch.device) -> FoldedOutput:
     """One pass with insight."""
-    channels = None if inputs.channels is None else inputs.channels.to(device)
-    return network(inputs.coordinates.to(device), channels, inputs.neighbors.to(device), insight=True)
+    return run_several(network, [inputs], device)[0]
+
+
+def run_several(network: FoldedGeoMoE, inputs: list[PairInput], device: torch.device) -> list[FoldedOutput]:
+    """One pass with insight, one pair under several motions: inputs that differ in their channels only."""
+    given = [one.channels for one in inputs if one.channels is not None]
+    channels = torch.stack(given).to(device) if given else None
+    first = inputs[0]
+    return network.under_motions(
+        first.coordinates.to(device), channels, first.neighbors.to(device), insight=True
+    )
 
 
 def geomoe_filter(weights: str | Path | None = None, estimator: EstimatorConfig | None = None) -> Filter:

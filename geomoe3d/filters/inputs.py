@@ -96,7 +96,7 @@ def pair_input(
     voxels = _check(correspondences, voxel_size, config)[1]
     coordinates = voxels / config.unit_voxels
     if config.judges_motions:
-        raise InputError("this network judges motions; prepare it with motion_inputs, which is given some")
+        raise InputError("this network judges motions; prepare it with MotionInputs, which is given some")
     given = {"feature_distance": feature_distance, "ratio": ratio, "mutual": mutual}
     compatibility = compatibility_inputs(voxels, config) if config.needs_compatibility else None
     channels: list[Tensor] = []
@@ -115,18 +115,11 @@ def pair_input(
     return PairInput(coordinates, torch.cat(channels, dim=1) if channels else None, neighbors)
 
 
-def motion_inputs(
-    correspondences: NDArray[Any] | Tensor,
-    motions: NDArray[Any],
-    viewpoints: tuple[NDArray[Any] | None, NDArray[Any] | None],
-    voxel_size: float,
-    config: NetworkConfig,
-) -> list[PairInput]:
-    """Prepare one pair for a network that judges motions: one input per motion.
+class MotionInputs:
+    """Prepares one pair for a network that judges motions; build once per pair, then ask for any motions.
 
     Args:
         correspondences: (N, 6) float, N >= 3, any unit.
-        motions: (K, 4, 4) p_target = R p_source + t, in the same coordinates.
         viewpoints: (3,) where the two sensors stood, same coordinates, or None for both.
         voxel_size: in the same unit.
         config: of a network with the channels ``aligned``.
@@ -134,12 +127,24 @@ def motion_inputs(
     Raises:
         InputError, NonFiniteError: as `pair_input`.
     """
-    points, voxels = _check(correspondences, voxel_size, config)
-    coordinates = voxels / config.unit_voxels
-    neighbors = find_neighbors(coordinates[None], config)[0]
-    aligned = AlignedChannels(points.numpy(), viewpoints, config.compatibility_threshold * voxel_size)
-    channels = torch.from_numpy(aligned(motions[:, :3, :3], motions[:, :3, 3]))
-    return [PairInput(coordinates, of_one, neighbors) for of_one in channels]
+
+    def __init__(
+        self,
+        correspondences: NDArray[Any] | Tensor,
+        viewpoints: tuple[NDArray[Any] | None, NDArray[Any] | None],
+        voxel_size: float,
+        config: NetworkConfig,
+    ) -> None:
+        points, voxels = _check(correspondences, voxel_size, config)
+        self._coordinates = voxels / config.unit_voxels
+        threshold = config.compatibility_threshold * voxel_size
+        self._neighbors = find_neighbors(self._coordinates[None], config)[0]
+        self._aligned = AlignedChannels(points.numpy(), viewpoints, threshold)
+
+    def under(self, motions: NDArray[Any]) -> list[PairInput]:
+        """One input for each motion p_target = R p_source + t, (K, 4, 4), in the correspondences' frames."""
+        channels = torch.from_numpy(self._aligned(motions[:, :3, :3], motions[:, :3, 3]))
+        return [PairInput(self._coordinates, of_one, self._neighbors) for of_one in channels]
 
 
 def collate(pairs: list[PairInput]) -> BatchInput:

@@ -2,12 +2,14 @@
 
 As a filter it lets consensus propose motions, judges them, and weighs the correspondences under the motion
 that it likes best. Registration asks it about the motions that the clouds like best. Cost at N =
-1000 on one core: about 10 ms, and 3 ms per motion.
+1000 on one core: about 10 ms, and 3 ms per motion; motions are judged side by side on more.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,33 +19,44 @@ from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import CheckpointError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.proposals import propose
+from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.base import FilterOutput
-from geomoe3d.filters.folded import FoldedGeoMoE
+from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.geomoe_filter import Insight, finite_rows, run
-from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, motion_inputs
+from geomoe3d.filters.geomoe_filter import Insight, finite_rows, run_several
+from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, MotionInputs
 from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
-from geomoe3d.threads import single_blas_thread
-from geomoe3d.types import Correspondences, FloatArray
+from geomoe3d.threads import each, single_blas_thread
+from geomoe3d.types import Correspondences, FloatArray, IntArray
 
-MOST_MOTIONS = 20
+MOST_MOTIONS = 8
 """Motions that the filter judges of those that consensus proposes."""
 MOST_ROWS = 1000
 """Correspondences that a motion is judged on; mutual ones first where there are more."""
+FIRST_MOTIONS = 2
+"""Motions that are judged before the filter asks itself whether it has seen enough."""
+CONVINCED = 3.0
+"""Verdict from which on the filter looks at no further motions."""
+_PARTS = 4  # of a lot, side by side; for any number of threads: last bits depend on how many share a batch
 
 
-@dataclass(frozen=True)
 class Judged:
     """What the network says under one motion.
 
     Attributes:
         verdict: logit that the motion is right.
-        output: weights of the N correspondences under it.
+        output: weights of the N correspondences under it, made when asked for.
     """
 
-    verdict: float
-    output: FilterOutput
+    def __init__(self, verdict: float, make: Callable[[], FilterOutput]) -> None:
+        self.verdict = verdict
+        self._make = make
+
+    @cached_property
+    def output(self) -> FilterOutput:
+        """See the class."""
+        return self._make()
 
 
 class MotionJudge:
@@ -86,40 +99,27 @@ class MotionJudge:
 
     @single_blas_thread()
     @single_torch_thread()
-    def judge(
-        self, correspondences: Correspondences, motions: FloatArray, *, voxel_size: float
-    ) -> list[Judged]:
-        """What the network says under each motion.
+    def about(self, correspondences: Correspondences, *, voxel_size: float) -> PairJudge:
+        """The judge of one pair's motions.
 
         Args:
             correspondences: N rows in local coordinates; free space is asked where ``viewpoints`` are given.
-            motions: (K, 4, 4) p_target = R p_source + t, same coordinates.
             voxel_size: the grid the points came from.
-
-        Returns:
-            One per motion, in order; none where fewer than 3 rows are finite.
         """
         seen, part = finite_rows(correspondences)
-        if len(seen) < MIN_CORRESPONDENCES or len(motions) == 0:
-            return []
-        views = part.viewpoints or (None, None)
-        found = []
-        for inputs in motion_inputs(part.points, motions, views, voxel_size, self.config):
-            out = run(self._network, inputs, self.device)
-            assert out.verdict is not None
-            insight = Insight.blind(len(correspondences), self.config.num_layers)
-            insight.fill(seen, out)
-            found.append(Judged(float(out.verdict), insight.output(self.config)))
-        return found
+        inputs = None
+        if len(seen) >= MIN_CORRESPONDENCES:
+            inputs = MotionInputs(part.points, part.viewpoints or (None, None), voxel_size, self.config)
+        return PairJudge(self._network, self.config, self.device, inputs, seen, len(correspondences))
 
     @single_blas_thread()
-    @single_torch_thread()
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
         """Weigh correspondences under the best motion; see `Filter`.
 
         Returns:
-            Weights, and as ``hypotheses`` what consensus proposed: the first `MOST_MOTIONS` in the order of
-            their verdicts, then the others. Where no motion is proposed all weights are 0.
+            Weights, and as ``hypotheses`` what consensus proposed: those looked at, of the first
+            `MOST_MOTIONS`, in the order of their verdicts, then the others. Where no motion is proposed all
+            weights are 0.
         """
         seen, part = finite_rows(correspondences)
         blind = Insight.blind(len(correspondences), self.config.num_layers).output(self.config)
@@ -138,13 +138,66 @@ class MotionJudge:
         few = likeliest_rows(part, MOST_ROWS, seed)
         first = found[:MOST_MOTIONS]
         motions = np.array([h.T_target_source for h in first])
-        judged = self.judge(few, motions, voxel_size=voxel_size)
+        judged = self.about(few, voxel_size=voxel_size)(motions, CONVINCED)
         order = np.argsort([-j.verdict for j in judged], kind="stable")
         ranked = [replace(first[k], verdict=judged[k].verdict) for k in order]
         output: FilterOutput = judged[order[0]].output
         if few is not correspondences:  # judged on some rows, weighed on all
-            output = self.judge(correspondences, motions[order[:1]], voxel_size=voxel_size)[0].output
-        return replace(output, hypotheses=(*ranked, *found[MOST_MOTIONS:]))
+            output = self.about(correspondences, voxel_size=voxel_size)(motions[order[:1]])[0].output
+        return replace(output, hypotheses=(*ranked, *found[len(judged) :]))
+
+
+class PairJudge:
+    """What the network says of motions of one pair's correspondences; see `MotionJudge.about`."""
+
+    def __init__(
+        self,
+        network: FoldedGeoMoE,
+        config: NetworkConfig,
+        device: torch.device,
+        inputs: MotionInputs | None,
+        seen: IntArray,
+        num_rows: int,
+    ) -> None:
+        self._network, self._config, self._device = network, config, device
+        self._inputs, self._seen, self._num_rows = inputs, seen, num_rows
+
+    @single_blas_thread()
+    def __call__(self, motions: FloatArray, enough: float = np.inf) -> list[Judged]:
+        """Judge motions, several at a time where there are threads.
+
+        Args:
+            motions: (K, 4, 4) p_target = R p_source + t, local coordinates.
+            enough: where one of the first `FIRST_MOTIONS` is given a verdict as high as this, the others are
+                not looked at.
+
+        Returns:
+            One per motion looked at, in order; none where fewer than 3 rows are finite.
+        """
+        found: list[Judged] = []
+        if self._inputs is None:
+            return found
+        first = len(motions) if enough == np.inf else FIRST_MOTIONS
+        for lot in (motions[:first], motions[first:]):
+            if len(lot) and all(j.verdict < enough for j in found):
+                parts = np.array_split(lot, min(_PARTS, len(lot)))
+                found += [judged for part in each(self._judge, parts) for judged in part]
+        return found
+
+    @single_torch_thread()
+    def _judge(self, motions: FloatArray) -> list[Judged]:
+        assert self._inputs is not None
+        outputs = run_several(self._network, self._inputs.under(motions), self._device)
+        return [
+            Judged(float(out.verdict), partial(self._output, out))
+            for out in outputs
+            if out.verdict is not None
+        ]
+
+    def _output(self, out: FoldedOutput) -> FilterOutput:
+        insight = Insight.blind(self._num_rows, self._config.num_layers)
+        insight.fill(self._seen, out)
+        return insight.output(self._config)
 
 
 def likeliest_rows(correspondences: Correspondences, limit: int, seed: int) -> Correspondences:

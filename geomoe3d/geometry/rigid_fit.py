@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geomoe3d.types import FloatArray
+
 Floats = NDArray[np.floating[Any]]
 
 
@@ -79,16 +81,13 @@ def squared_residuals(R: Floats, t: Floats, source: Floats, target: Floats) -> F
     return result
 
 
-def spread(points: Floats, weights: Floats) -> float:
-    """Second largest standard deviation of weighted points (N, 3): zero where they are collinear.
+def spread(points: Floats, weights: Floats) -> FloatArray:
+    """Second largest standard deviation of points (N, 3) weighted (..., N): zero where they are collinear.
 
     Three directions of scatter decide a rigid fit: with the second at zero the rotation about the line is
-    free. Returns 0 for no points or zero weights.
+    free. Returns (...) float64, 0 for no points or zero weights.
     """
-    total = weights.sum()
-    if total <= 0:
-        return 0.0
-    mean = np.einsum("n,nd->d", weights, points) / total
-    centred = (points - mean).astype(np.float64)
-    covariance = np.einsum("ni,nj->ij", centred * weights[:, None], centred) / total
-    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)))
+    w = weights / np.maximum(weights.sum(-1, keepdims=True), np.finfo(weights.dtype).tiny)
+    centred = points - np.einsum("...n,nd->...d", w, points)[..., None, :]
+    covariance = np.einsum("...ni,...nj->...ij", centred * w[..., None], centred)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance.astype(np.float64))[..., 1], 0.0))

@@ -1,7 +1,7 @@
 """Random changes of a training pair that keep its labels right.
 
-Clouds turned by any rotation and moved, roles exchanged, coordinates jittered, correspondences left out.
-Scale needs none: the network divides by the voxel size.
+Clouds turned by any rotation and moved, roles exchanged, coordinates jittered, bent as a drifting sensor
+bends them, correspondences left out. Scale needs none: the network divides by the voxel size.
 """
 
 from __future__ import annotations
@@ -23,6 +23,14 @@ class AugmentationConfig(Section):
     rotate: bool = Field(True, description="turn each cloud by a uniform random rotation")
     swap: float = Field(0.5, ge=0, le=1, description="chance that source and target change roles")
     jitter: float = Field(0.1, ge=0, description="largest shift of a coordinate, in voxels")
+    bend: float = Field(
+        0.0, ge=0, description="amplitude of a smooth bend of each cloud, in voxels: at most this, any below"
+    )
+
+
+_BEND_WAVES = 3
+_BEND_VOXELS = (30.0, 150.0)
+"""Wavelengths of a bend: 1.5 to 7.5 m at 5 cm, from a piece of furniture to more than a fragment."""
 
 
 def augment(
@@ -44,10 +52,25 @@ def augment(
         halves = [(halves[0] - middles[0]) @ A.T, (halves[1] - middles[1]) @ B.T]
         R = B @ T[:3, :3] @ A.T
         T = _motion(R, B @ (T[:3, :3] @ middles[0] + T[:3, 3] - middles[1]))
+    if config.bend:
+        halves = [_bent(half, config.bend, pair.voxel_size, rng) for half in halves]
     points = np.concatenate(halves, axis=1)
     if config.jitter:
         points = points + rng.uniform(-config.jitter, config.jitter, points.shape) * pair.voxel_size
     return replace(pair, correspondences=points.astype(np.float32), T_target_source=T)
+
+
+def _bent(points: FloatArray, most: float, voxel_size: float, rng: np.random.Generator) -> FloatArray:
+    """Points (N, 3) moved by a sum of long waves; equal points stay equal."""
+    amplitude = rng.uniform(0, most) * voxel_size / np.sqrt(_BEND_WAVES)
+    moved: FloatArray = points.copy()
+    for _ in range(_BEND_WAVES):
+        low, high = np.log(_BEND_VOXELS)
+        length = np.exp(rng.uniform(low, high)) * voxel_size
+        along, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        phase = points @ along * (2 * np.pi / length) + rng.uniform(0, 2 * np.pi)
+        moved += amplitude * np.sin(phase)[:, None] * shift
+    return moved
 
 
 def _motion(R: FloatArray, t: FloatArray) -> FloatArray:

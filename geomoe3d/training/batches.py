@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.inputs import BatchInput, PairInput, collate, motion_inputs, pair_input
+from geomoe3d.filters.inputs import BatchInput, MotionInputs, PairInput, collate, pair_input
 from geomoe3d.geometry.se3 import rotation_error_deg
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
@@ -129,7 +129,7 @@ def make_sample(
         views: tuple[Any, Any] = (None, None)
         if pair.viewpoints is not None and not (rng is not None and rng.random() < data.hidden_viewpoints):
             views = (pair.viewpoints[0], pair.viewpoints[1])
-        several = motion_inputs(points, motions, views, pair.voxel_size, network)
+        several = MotionInputs(points, views, pair.voxel_size, network).under(motions)
         return Sample(tuple(several), labels, truth, torch.from_numpy(right))
     inputs = pair_input(
         points,

@@ -1,0 +1,76 @@
+"""Work side by side gives what a loop gives."""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from geomoe3d import threads
+from geomoe3d.threads import each, usable_threads
+
+
+@pytest.fixture
+def three_threads(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+
+
+def test_results_are_in_the_order_of_the_items(three_threads):
+    assert each(lambda x: x * x, range(100)) == [x * x for x in range(100)]
+    assert each(lambda x: x, []) == []
+
+
+def test_items_are_done_at_the_same_time(three_threads):
+    meeting = threading.Barrier(3, timeout=10)  # passes only where three stand at it together
+    each(lambda _: meeting.wait(), range(3))
+
+
+def test_one_thread_is_a_plain_loop(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert set(each(lambda _: threading.get_ident(), range(5))) == {threading.get_ident()}
+
+
+def test_the_first_failure_in_order_is_raised(three_threads):
+    def fail(x):
+        if x >= 4:
+            raise KeyError(x)
+        return x
+
+    with pytest.raises(KeyError, match="4"):
+        each(fail, range(9))
+
+
+def test_one_inside_another_is_a_loop(three_threads):
+    def inner(_):
+        outside = threading.get_ident()
+        return each(lambda _: threading.get_ident(), range(4)) == [outside] * 4
+
+    assert all(each(inner, range(6)))
+
+
+def test_many_callers_share_the_helpers(three_threads):
+    with ThreadPoolExecutor(8) as pool:
+        sums = list(pool.map(lambda k: sum(each(lambda x: x + k, range(20))), range(40)))
+    assert sums == [190 + 20 * k for k in range(40)]
+
+
+@pytest.mark.parametrize("given", ["", "none", "0", "-2"])
+def test_threads_without_a_usable_number_are_the_cores(monkeypatch, given):
+    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    assert 1 <= usable_threads() <= (os.cpu_count() or 1)
+
+
+def test_threads_as_the_variable_says(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "5,2")
+    assert usable_threads() == 5
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_process_has_helpers_of_its_own(three_threads):
+    each(lambda x: x, range(3))
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if threads.each(lambda x: x + 1, range(9)) == list(range(1, 10)) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -73,7 +73,7 @@ def finished_result(
         reasons=findings.judgement.reasons,
         confidence=findings.judgement.confidence,
         overlap=findings.evidence.overlap if findings.evidence else 0.0,
-        evidence=_evidence(findings.evidence) if findings.evidence else {},
+        evidence=_evidence(findings.evidence, findings.information) if findings.evidence else {},
         num_correspondences=len(matched),
         num_inliers=int((findings.residuals(matched) < threshold).sum()),
         inlier_threshold=threshold,
@@ -149,10 +149,15 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
     return tuple(versions.items())
 
 
-def _evidence(evidence: Evidence) -> dict[str, float]:
-    """Its numbers by name; without a network there is no verdict."""
+def _evidence(evidence: Evidence, information: Information) -> dict[str, float]:
+    """Their numbers by name; without a network there is no verdict."""
     values = {name: value for name, value in asdict(evidence).items() if value is not None}
-    return {**values, "surface_score": evidence.surface_score, "score": evidence.score}
+    return {
+        **values,
+        "surface_score": evidence.surface_score,
+        "score": evidence.score,
+        "observability": information.observability,
+    }
 
 
 def _alternative(findings: Findings, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:

@@ -34,12 +34,15 @@ _DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two motions are d
 
 
 class Refined(NamedTuple):
-    """A motion (4, 4) in local coordinates, its evidence, what went wrong if anything, and where it began."""
+    """A motion (4, 4) in local coordinates, its evidence, and what went wrong if anything.
+
+    ``weighed`` is what the network said of the correspondences under it; None where it was not asked.
+    """
 
     T_target_source: FloatArray
     evidence: Evidence
     note: str | None
-    start: Hypothesis
+    weighed: FilterOutput | None
 
 
 class Chooser:
@@ -65,13 +68,13 @@ class Chooser:
     ) -> None:
         self._described, self._matched, self._threshold = described, matched, threshold
         self._config, self._clock, self._network = config, clock, network
-        self._weighed: list[tuple[Hypothesis, FilterOutput]] = []
         clock("verify")
         self._verifier = Verifier(*described, threshold, seed=config.seed)
         self._refiner = Refiner(*described, config.refinement)
         self._ranked: list[tuple[Hypothesis, Evidence]] = []
         self._first: Hypothesis | None = None
-        self._refined: dict[bytes, tuple[FloatArray, str | None, list[Evidence]]] = {}
+        self._refined: dict[bytes, Refined] = {}
+        self._judged: dict[bytes, Judged] = {}
 
     def consider(self, hypotheses: list[Hypothesis]) -> None:
         """Add a lot of hypotheses, the estimator's best one first."""
@@ -107,9 +110,7 @@ class Chooser:
         information = measure_information(T, source, target, self._threshold)
         support = self._support(T)
         judgement = judge(answer.evidence, lead, support, information, self._config.judgement, rival)
-        findings = Findings(
-            T, other, lead, answer.evidence, information, judgement, self._weights_under(answer.start)
-        )
+        findings = Findings(T, other, lead, answer.evidence, information, judgement, answer.weighed)
         return findings if answer.note is None else findings.with_note(answer.note)
 
     def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
@@ -134,6 +135,7 @@ class Chooser:
         if len(judged) < len(shown):
             return False
         said = {id(h): found for h, found in zip(shown, judged, strict=True)}
+        self._judged.update((h.T_target_source.tobytes(), said[id(h)]) for h in shown)
         known = [h.verdict for h, _ in self._ranked if h.verdict is not None]
         unseen = min([_UNSEEN_VERDICT, *known, *(found.verdict for found in judged)])
         ranked = []
@@ -141,15 +143,10 @@ class Chooser:
             found = said.get(id(hypothesis))
             if found is not None:
                 hypothesis = replace(hypothesis, verdict=found.verdict)
-                self._weighed.append((hypothesis, found.output))
             verdict = unseen if hypothesis.verdict is None else hypothesis.verdict
             ranked.append((hypothesis, replace(evidence, verdict=verdict)))
         self._ranked = best_first(ranked)
         return True
-
-    def _weights_under(self, hypothesis: Hypothesis | None) -> FilterOutput | None:
-        """What the network said of the correspondences under a motion; None where it was not asked."""
-        return next((output for shown, output in self._weighed if shown is hypothesis), None)
 
     def _answer(self, num_refined: int) -> Refined | None:
         """The motion that the clouds, or without verification the correspondences, like best, refined."""
@@ -164,27 +161,38 @@ class Chooser:
     def _refine(self, hypothesis: Hypothesis, verdict: float | None) -> Refined:
         """The motion refined on the clouds, or as it was where that made them fit less well.
 
-        The network's ``verdict`` on the motion before holds for the refined one too.
+        What the network has judged it judges again after refinement; else ``verdict`` holds, a guess.
         """
-        T_target_source = hypothesis.T_target_source
-        key = T_target_source.tobytes()
+        key = hypothesis.T_target_source.tobytes()
         if key not in self._refined:  # a second look often likes what the first one did
-            T, note = self._refiner(T_target_source)
-            evidence = [self._verifier.evidence(motion) for motion in (T_target_source, T)]
-            self._refined[key] = T, note, evidence
-        T, note, evidence = self._refined[key]
-        before, after = (replace(of_motion, verdict=verdict) for of_motion in evidence)
+            self._refined[key] = self._refined_anew(hypothesis)
+        found = self._refined[key]
+        if hypothesis.verdict is None:
+            return found._replace(evidence=replace(found.evidence, verdict=verdict))
+        if found.evidence.verdict is None and self._network is not None:
+            after = found.T_target_source.tobytes()
+            judged = self._judged.get(after) or self._network(found.T_target_source[None])[0]
+            evidence = replace(found.evidence, verdict=judged.verdict)
+            found = found._replace(evidence=evidence, weighed=judged.output)
+            self._refined[key] = found
+        return found
+
+    def _refined_anew(self, hypothesis: Hypothesis) -> Refined:
+        """By the clouds alone."""
+        T, note = self._refiner(hypothesis.T_target_source)
+        before, after = (self._verifier.evidence(motion) for motion in (hypothesis.T_target_source, T))
         if after.score < _KEPT_EVIDENCE * before.score:
             note = "refinement made the clouds fit less well; the unrefined motion is given"
-            return Refined(T_target_source, before, note, hypothesis)
-        return Refined(T, after, note, hypothesis)
+            return Refined(hypothesis.T_target_source, before, note, None)
+        return Refined(T, after, note, None)
 
     def _rival(self, answer: Refined) -> tuple[Hypothesis | None, float, Evidence | None]:
         """The best clearly different motion, the answer's lead over it, and its evidence."""
         T, source = answer.T_target_source, self._described[0]
         other = clearly_different(self._ranked, T, source, self._shift)
         lead = lead_over(answer.evidence, other[1] if other else None)
-        if other is not None and lead < _CLOSE_LEAD:  # a fair race: the rival is refined too
+        # A fair race: a rival that the clouds like about as well is refined too, and judged again.
+        if other is not None and lead_over(answer.evidence.by_clouds(), other[1].by_clouds()) < _CLOSE_LEAD:
             rival = self._refine(other[0], other[1].verdict)
             if rival.evidence.score > other[1].score:
                 moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence

@@ -1,13 +1,13 @@
 """How sure: status, reasons and confidence from the evidence, and the information of the fit.
 
 Place: judge, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
-the clouds, its lead over the best clearly different motion, the share of correspondences that agree, the
-overlap, and the verdict of the network where there is one.
+the clouds, its lead over the best clearly different motion, the overlap, how firmly the shared surface holds
+the source, and the verdict of the network, or the share of correspondences that agree where there is none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,14 +18,15 @@ from geomoe3d.types import FloatArray, PreparedCloud
 from geomoe3d.verification import MOST_VERDICT, Evidence
 
 # Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
-# one, mixed by overlap as the benchmarks are, and on unrelated pairs: 180 and 90 pairs without a network, 300
-# and 150 with one, each with one look and with two; docs/measurements.md holds what came of it on real scans.
-_OFFSET = 8.733
-_SLOPES = np.array([2.711, 0.871, -3.638, 2.403])
-_OFFSET_WITH_VERDICT = -1.027
-_SLOPES_WITH_VERDICT = np.array([1.718, 0.958, -2.531, 0.686])
-_LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP = 1e-3, 0.002, 0.01
+# one, mixed by overlap as the benchmarks are, and on unrelated pairs: 300 and 150 pairs, each with one look and
+# with two; docs/measurements.md holds what came of it on real scans.
+_OFFSET = 8.763
+_SLOPES = np.array([1.245, 0.847, -1.49, 0.941, -76.562, 1.253])
+_OFFSET_WITH_VERDICT = 1.233
+_SLOPES_WITH_VERDICT = np.array([1.31, 0.577, -2.041, 0.645, -44.994, 0.636])
+_LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002, 0.01, 1e-3
 _MOST_LEAD = 30.0
+_MOST_VIOLATION = 0.1
 UNRIVALLED_LEAD = 3.0
 _LIKELY = 0.5
 _CLOSE_VERDICTS = 2.0  # odds of seven to one
@@ -110,7 +111,7 @@ def judge(
         ``ambiguous`` where the surfaces let the source slide, or where the answer would be likely but another
         motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
-    confidence = confidence_score(evidence, lead, support)
+    confidence = confidence_score(evidence, lead, support, information.observability)
     notes = []
     if evidence.overlap < _LOW_OVERLAP:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -127,7 +128,7 @@ def judge(
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
-    alone = confidence_score(replace(evidence, verdict=None), UNRIVALLED_LEAD, support)
+    alone = confidence_score(evidence.by_clouds(), UNRIVALLED_LEAD, support, information.observability)
     close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(evidence, rival, config.ambiguity_ratio)
     if close and alone >= _LIKELY:
         notes.append(
@@ -165,36 +166,48 @@ def lead_over(evidence: Evidence, other: Evidence | None) -> float:
     return evidence.score / other.score if other.score > 0 else float("inf")
 
 
-CONFIDENCE_INPUTS = ("log evidence", "log lead", "log overlap", "log support")
+CONFIDENCE_INPUTS = (
+    "log evidence",
+    "log lead",
+    "log overlap",
+    "log observability",
+    "free-space violation",
+    "log support",
+)
 """What the confidence is made of without a network, in the order of `confidence_inputs`.
 
 With one, its verdict stands in the place of the support, which the network sees itself."""
 
 
-def confidence_inputs(evidence: Evidence, lead: float, support: float) -> FloatArray:
-    """(4,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
+def confidence_inputs(evidence: Evidence, lead: float, support: float, observability: float) -> FloatArray:
+    """(6,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
 
-    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. The last entry
-    is the verdict of the network, bounded, where there is one, and the logarithm of the support where not.
+    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. A surface that
+    hardly holds the source is one: the answer may have slid off along it. The violation enters as it is,
+    bounded, beside its part in the evidence, which choosing needs but which is not all that it says of the
+    answer. The last entry is the verdict of the network, bounded, where there is one, and the logarithm of
+    the support where not.
     """
     shared = np.log(
         [
             max(evidence.surface_score, _LEAST_SCORE),
             min(max(lead, 0.5), _MOST_LEAD),
             evidence.overlap + _LEAST_OVERLAP,
+            observability + _ADDED_OBSERVABILITY,
         ]
     )
+    shared = np.append(shared, min(evidence.free_space_violation, _MOST_VIOLATION))
     if evidence.verdict is None:
         return np.append(shared, np.log(support + _LEAST_SUPPORT))
     return np.append(shared, np.clip(evidence.verdict, -MOST_VERDICT, MOST_VERDICT))
 
 
-def confidence_score(evidence: Evidence, lead: float, support: float) -> float:
+def confidence_score(evidence: Evidence, lead: float, support: float, observability: float) -> float:
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
     if evidence.score <= 0:
         return 0.0
     offset, slopes = _OFFSET, _SLOPES
     if evidence.verdict is not None:
         offset, slopes = _OFFSET_WITH_VERDICT, _SLOPES_WITH_VERDICT
-    strength = offset + confidence_inputs(evidence, lead, support) @ slopes
+    strength = offset + confidence_inputs(evidence, lead, support, observability) @ slopes
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

@@ -50,7 +50,7 @@ class Explanation:
         source, target: the clouds as loaded, full resolution, local coordinates.
         correspondences: what was given to the estimator, local coordinates; empty where it never came to it.
         weighed: what the filter said of them, in the same order; of a network that judges motions, what it
-            said under the answer before refinement, all zero where there was none.
+            said under the answer, all zero where there was none.
         inliers: (K,) True where a correspondence agrees with the answer.
     """
 

@@ -11,7 +11,7 @@ at most ``num_queries`` points of each are asked.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,6 +54,10 @@ class Evidence:
     def surface_score(self) -> float:
         """See the class; what the clouds alone say."""
         return max(self.distinctiveness, 0.0) * float(np.exp(-_VIOLATION_WEIGHT * self.free_space_violation))
+
+    def by_clouds(self) -> Evidence:
+        """The same without what a network says."""
+        return replace(self, verdict=None)
 
     @property
     def score(self) -> float:

@@ -96,6 +96,7 @@ def measure(
                     "status": result.status,
                     "lead": lead_of(result),
                     "support": result.num_inliers / max(result.num_correspondences, 1),
+                    "observability": result.evidence.get("observability", 0.0),
                     "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
                 }
                 known[(source, target, look)] = record
@@ -126,6 +127,8 @@ def main() -> None:
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import log_loss, roc_auc_score
     from sklearn.model_selection import GroupKFold, cross_val_predict
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
 
     if given.measured:
         records = [json.loads(line) for line in Path(given.out).read_text().splitlines()]
@@ -134,12 +137,19 @@ def main() -> None:
         pairs = draw(given.folders, given.pairs, given.unrelated)
         records = measure(pairs, Path(given.out), given.assignments)
     records = [r for r in records if r["evidence"] is not None]
-    X = np.array([confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"]) for r in records])
+    X = np.array(
+        [
+            confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"], r["observability"])
+            for r in records
+        ]
+    )
     y = np.array([r["right"] for r in records])
     related = np.array([r["related"] for r in records])
     weight = np.where(related, 1.0, UNRELATED_WEIGHT)
     print(f"{related.sum()} related pairs, {y[related].mean():.1%} right; {(~related).sum()} unrelated")
-    model = LogisticRegression(C=10.0)
+    # On inputs of equal spread the penalty is the same for each. It matters: fitted almost without one, the
+    # coefficients follow the generated rooms too closely, and the verdict, surer there, weighs too much.
+    model = make_pipeline(StandardScaler(), LogisticRegression())
     p = cross_val_predict(
         model,
         X,
@@ -147,7 +157,7 @@ def main() -> None:
         groups=[r["scene"] for r in records],
         cv=GroupKFold(5),
         method="predict_proba",
-        params={"sample_weight": weight},
+        params={"logisticregression__sample_weight": weight},
     )[:, 1]
     print(
         f"log loss {log_loss(y[related], p[related]):.4f}, AUROC {roc_auc_score(y[related], p[related]):.4f}"
@@ -160,11 +170,14 @@ def main() -> None:
             f"above {least}: {above.sum() / related.sum():.1%} of the related, {y[above].mean():.2%} right; "
             f"{(p[~related] > least).mean():.2%} of the unrelated"
         )
-    model.fit(X, y, sample_weight=weight)
+    model.fit(X, y, logisticregression__sample_weight=weight)
+    scaler, logistic = model[0], model[1]
+    slopes = logistic.coef_[0] / scaler.scale_
+    offset = float(logistic.intercept_[0] - slopes @ scaler.mean_)
     verdicts = "verdict" in records[0]["evidence"]
     names = (*CONFIDENCE_INPUTS[:-1], "verdict") if verdicts else CONFIDENCE_INPUTS
-    print(f"{', '.join(names)}: {np.round(model.coef_[0], 3).tolist()}")
-    print(f"offset: {model.intercept_[0]:.3f}")
+    print(f"{', '.join(names)}: {np.round(slopes, 3).tolist()}")
+    print(f"offset: {offset:.3f}")
 
 
 if __name__ == "__main__":

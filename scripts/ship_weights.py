@@ -23,8 +23,8 @@ from geomoe3d.training.logs import read_csv
 
 NOTES = (
     "GeoMoE that judges motions; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
-    "through scene meshes (MIT-0) and one recorded lounge; never on 3DMatch or 3DLoMatch. Steps are those of "
-    "the last run; docs/training.md tells of the runs before it."
+    "through scene meshes (MIT-0) and one recorded lounge; never on 3DMatch or 3DLoMatch. docs/training.md "
+    "tells of the run."
 )
 
 

@@ -72,14 +72,14 @@ def test_without_verification_the_first_of_the_first_lot_is_the_answer(pair):
 
 
 def opinions(*liked: np.ndarray):
-    """A network that believes in the given motions and in no other; and what it was shown."""
+    """A network that believes in motions close to the given ones and in no other; and what it was shown."""
     shown = []
 
     def network(motions):
         shown.extend(motions)
         return [
             Judged(
-                6.0 if any(np.array_equal(m, x) for x in liked) else -6.0,
+                6.0 if any(np.abs(m - x).max() < 0.1 for x in liked) else -6.0,
                 partial(FilterOutput, np.full(3, k + 1.0)),
             )
             for k, m in enumerate(motions)
@@ -112,14 +112,29 @@ def test_a_network_turns_the_choice_where_the_clouds_waver(pair):
 def test_a_network_is_shown_a_few_distinct_motions_once(pair):
     motions = [off(pair[1], angle, 0.0) for angle in (0, 1, 40, 80, 120, 160)]
     network, shown = opinions(motions[0].T_target_source)
+    given = {h.T_target_source.tobytes() for h in motions}
     asked = with_network(pair, network)
     asked.consider(motions)
     asked.conclude(1, 2)
-    assert len(shown) == 2
+    assert len(shown) == 3  # two hypotheses, and the better one again once it is refined
+    assert sum(m.tobytes() in given for m in shown) == 2
     findings = asked.conclude(3, 4)
-    assert len(shown) == 4
-    assert len({m.tobytes() for m in shown}) == 4
+    assert sum(m.tobytes() in given for m in shown) == 4
+    assert len({m.tobytes() for m in shown}) == len(shown)
     assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
+
+
+def test_the_verdict_is_on_the_refined_motion(pair):
+    """A start 4 degrees off, which the network doubts; refined it is as good as the truth, which it likes."""
+    network, _ = opinions(pair[1])
+    asked = with_network(pair, network)
+    asked.consider([off(pair[1], 8, 0.05)])
+    findings = asked.conclude()
+    assert findings.evidence.verdict == 6.0
+    assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
+    plain = with_network(pair, network, "refinement.method=none")
+    plain.consider([off(pair[1], 8, 0.05)])
+    assert plain.conclude().evidence.verdict == -6.0
 
 
 def test_without_verification_no_network_is_asked(pair):

@@ -323,18 +323,22 @@ def test_the_threshold_is_the_users(least: float) -> None:
 
 def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
     scores, leads = np.geomspace(1e-6, 50, 40), [*np.geomspace(0.5, 30, 20), np.inf]
-    table = np.array([[confidence_score(evidence(s), x, 0.05) for x in leads] for s in scores])
+    table = np.array([[confidence_score(evidence(s), x, 0.05, 0.1) for x in leads] for s in scores])
     assert ((table >= 0) & (table <= 1)).all()
     assert (np.diff(table, axis=0) >= 0).all()
     assert (np.diff(table, axis=1) >= 0).all()
-    assert table[0, 0] < 0.001
+    assert table[0, 0] < 0.01
     assert table[-1, -1] > 0.999
-    assert confidence_score(evidence(0.0), np.inf, 0.05) == confidence_score(evidence(-1.0), 5.0, 0.05) == 0
+    assert (
+        confidence_score(evidence(0.0), np.inf, 0.05, 0.1)
+        == confidence_score(evidence(-1.0), 5.0, 0.05, 0.1)
+        == 0
+    )
 
 
 def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:
-    by_support = [confidence_score(evidence(0.2), 2.0, x) for x in (0, 0.005, 0.02, 0.3)]
-    by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05) for x in (0.1, 0.3, 0.9)]
+    by_support = [confidence_score(evidence(0.2), 2.0, x, 0.1) for x in (0, 0.005, 0.02, 0.3)]
+    by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05, 0.1) for x in (0.1, 0.3, 0.9)]
     assert by_support == sorted(set(by_support))
     assert by_overlap == sorted(set(by_overlap), reverse=True)
 

@@ -1,7 +1,7 @@
 """Nearest neighbours in feature space, exact, with bounded memory.
 
 Place: match. Blocks of the similarity matrix are formed by matrix products, about 12 MB at a time for each
-thread; O(n m) time: on two cores 5,000 against 5,000 points take some 20 ms, 30,000 against 30,000 about 0.7 s.
+thread; O(n m) time: on two cores 5,000 against 5,000 points take some 20 ms, 30,000 against 30,000 0.7 s.
 """
 
 from __future__ import annotations

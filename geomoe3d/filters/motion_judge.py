@@ -30,7 +30,7 @@ from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.threads import each, single_blas_thread
 from geomoe3d.types import Correspondences, FloatArray, IntArray
 
-MOST_MOTIONS = 8
+MOST_MOTIONS = 6
 """Motions that the filter judges of those that consensus proposes."""
 MOST_ROWS = 1000
 """Correspondences that a motion is judged on; mutual ones first where there are more."""

@@ -97,12 +97,15 @@ class VerificationConfig(Section):
 
 
 class SecondLookConfig(Section):
-    """More work on a pair whose first answer is not ok."""
+    """More work on a pair whose first answer is doubtful."""
 
     grids: tuple[float, ...] = Field(
         (1.5, 2.0),
         description="coarser grids, in voxels, on which further hypotheses are sought when the first answer "
-        "is not ok; none: the first answer stands",
+        "is doubtful; none: the first answer stands",
+    )
+    below: float = Field(
+        0.8, ge=0, le=1, description="an answer that is not ok is doubtful below this confidence"
     )
     num_refined: int = Field(
         3, ge=1, description="so many of the best distinct hypotheses are polished before the choice"

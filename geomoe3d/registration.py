@@ -32,6 +32,7 @@ from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import solve
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
+from geomoe3d.judge import Judgement
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
 from geomoe3d.threads import single_blas_thread
@@ -177,7 +178,7 @@ class Registrar:
             if initial is not None:
                 chooser.consider_guess(initial)
             findings = chooser.conclude()
-            if findings.judgement.status != "ok" and config.verification.enabled and config.second_look.grids:
+            if self._is_doubtful(findings.judgement):
                 for grid in config.second_look.grids:
                     chooser.consider(self.propose_on_grid(grid * voxel_size, described, clock))
                 findings = chooser.conclude(config.second_look.num_refined, config.second_look.num_judged)
@@ -256,6 +257,12 @@ class Registrar:
         except EmptyCloudError:
             return []
         return self.propose((source, target), clock)[2]
+
+    def _is_doubtful(self, judgement: Judgement) -> bool:
+        """Whether a second look is to be taken, on coarser grids."""
+        look = self.config.second_look
+        doubtful = judgement.status != "ok" and judgement.confidence < look.below
+        return doubtful and self.config.verification.enabled and len(look.grids) > 0
 
     @property
     def _shows_motions(self) -> bool:

@@ -179,9 +179,21 @@ def test_a_sure_answer_takes_no_second_look(grids_seen):
     assert grids_seen == [1]
 
 
+UNSURE = ["judgement.min_confidence=1.0", "second_look.below=1.0"]
+
+
+def test_an_answer_not_ok_but_likely_takes_no_second_look(grids_seen):
+    source, target, _ = make_sample_pair(seed=0)
+    registrar = Registrar(load_config(None, [f"voxel_size={VOXEL}", "judgement.min_confidence=1.0"]))
+    answer = registrar.register(source, target)
+    assert answer.status == "low_confidence"
+    assert 0.8 < answer.confidence < 1
+    assert grids_seen == [1]
+
+
 def test_an_unsure_answer_takes_one_on_every_coarser_grid(grids_seen):
     source, target, T = make_sample_pair(seed=0)
-    settings = [f"voxel_size={VOXEL}", "judgement.min_confidence=1.0"]
+    settings = [f"voxel_size={VOXEL}", *UNSURE]
     result = Registrar(load_config(None, settings)).register(source, target)
     assert grids_seen == [1, 1.5, 2]
     assert rotation_error_deg(result.T_target_source, T) < 1
@@ -201,7 +213,7 @@ def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatc
 
     monkeypatch.setattr(Registrar, "describe_cloud", small)
     source, target, _ = make_sample_pair(seed=0)
-    settings = [f"voxel_size={VOXEL}", "judgement.min_confidence=1.0"]
+    settings = [f"voxel_size={VOXEL}", *UNSURE]
     assert Registrar(load_config(None, settings)).register(source, target).status != "failed"
     assert grids_seen == [1]
 

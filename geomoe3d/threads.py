@@ -3,7 +3,7 @@
 Products of some hundred rows are over before a second thread has woken up; on a machine whose cores have
 other work, waiting for it made solving four times slower. So BLAS keeps to one thread (`single_blas_thread`),
 and work is divided where its parts are independent and large (`each`). Either way the same last bits come
-out on any number of cores. Large products (matching of large clouds) keep the library's threads.
+out on any number of cores.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     """``[function(item) for item in items]``, several at a time where there are threads for it.
 
     Results are in order, and the first item's exception in order is raised, as in a loop; but all items are
-    begun. One inside another is a plain loop. Worth it from about a millisecond per item, spent outside the
-    interpreter (numpy, torch).
+    begun. One inside another is a plain loop, and BLAS keeps to one thread. Worth it from about a millisecond
+    per item, spent outside the interpreter (numpy, torch).
     """
     todo = list(items)
-    threads = 1 if getattr(_inside, "busy", False) else min(usable_threads(), len(todo))
-    if threads < 2:
+    usable = 1 if getattr(_inside, "busy", False) else usable_threads()
+    if min(usable, len(todo)) < 2:
         return [function(item) for item in todo]
     futures: list[Future[Result]] = [Future() for _ in todo]
     numbers = iter(range(len(todo)))  # shared by the threads: `next` on it is atomic
@@ -77,14 +77,23 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
                     futures[number].set_result(function(todo[number]))
                 except BaseException as error:
                     futures[number].set_exception(error)
+                    if not isinstance(error, Exception):  # an interrupt: nothing further is begun
+                        for left in numbers:
+                            futures[left].set_exception(error)
         finally:
             _inside.busy = False
 
-    pool = _pool(os.getpid(), usable_threads() - 1)
-    for _ in range(threads - 1):
-        pool.submit(work)
-    work()
-    return [future.result() for future in futures]
+    with single_blas_thread():
+        helpers = []
+        try:
+            for _ in range(min(usable, len(todo)) - 1):
+                helpers.append(_pool(os.getpid(), usable - 1).submit(work))
+        except RuntimeError:  # no thread can be started, as where the interpreter is ending: alone, then
+            pass
+        work()
+        for helper in helpers:  # one that never began, as others kept the pool busy, has nothing to do
+            helper.cancel()
+        return [future.result() for future in futures]
 
 
 @lru_cache(maxsize=1)

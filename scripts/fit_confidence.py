@@ -6,7 +6,8 @@
 FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
 recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix them, unrelated ones from
 different scenes. Every pair is registered twice, without a second look and always with one, since the
-confidence decides about it; the outcomes go to OUT, and what is there is not done again. Prints
+confidence decides about it; the outcomes go to OUT, and what is there is not done again: give another OUT for
+other weights or code. Prints
 coefficients for `geomoe3d/judge.py`, cross-validated over scenes. Needs scikit-learn, which the package
 itself does not.
 """
@@ -69,7 +70,7 @@ def measure(
     known = {
         (r["source"], r["target"], r["look"]): r
         for r in map(json.loads, lines)
-        if r["assignments"] == assignments
+        if r["assignments"] == assignments and "observability" in r  # not of an earlier version
     }
     registrars = [Registrar(load_config(None, [*assignments, *look])) for look in LOOKS]
     with out.open("a") as file:
@@ -132,7 +133,7 @@ def main() -> None:
 
     if given.measured:
         records = [json.loads(line) for line in Path(given.out).read_text().splitlines()]
-        records = [r for r in records if r["assignments"] == given.assignments]
+        records = [r for r in records if r["assignments"] == given.assignments and "observability" in r]
     else:
         pairs = draw(given.folders, given.pairs, given.unrelated)
         records = measure(pairs, Path(given.out), given.assignments)

@@ -125,7 +125,7 @@ def test_a_network_is_shown_a_few_distinct_motions_once(pair):
 
 
 def test_the_verdict_is_on_the_refined_motion(pair):
-    """A start 4 degrees off, which the network doubts; refined it is as good as the truth, which it likes."""
+    """A start 8 degrees off, which the network doubts; refined it is as good as the truth, which it likes."""
     network, _ = opinions(pair[1])
     asked = with_network(pair, network)
     asked.consider([off(pair[1], 8, 0.05)])

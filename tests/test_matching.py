@@ -266,3 +266,18 @@ def test_matches_do_not_depend_on_the_number_of_threads(tmp_path: Path) -> None:
             answers.append([data[f"arr_{k}"] for k in range(4)])
     for k, tolerance in enumerate((0, 1e-5, 1e-5, 0)):
         np.testing.assert_allclose(answers[0][k], answers[1][k], rtol=0, atol=tolerance)
+
+
+def test_blocks_share_the_best_of_every_column(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many small blocks, on several threads, say the same of mutual matches as one; no source is no error."""
+    rng = np.random.default_rng(4)
+    a, b = (rng.normal(size=(n, 33)).astype(np.float32) for n in (300, 200))
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    whole = matching.nearest_features(a, b, 2)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.setattr(matching, "_BLOCK_ENTRIES", 1000)
+    parts = matching.nearest_features(a, b, 2)
+    for x, y in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-6)
+    assert 0 < parts[3].sum() < 300
+    assert len(matching.nearest_features(a[:0], b, 1)[0]) == 0

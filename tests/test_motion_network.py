@@ -354,6 +354,20 @@ def test_verdicts_are_the_same_for_any_number_of_threads(monkeypatch: pytest.Mon
     assert found[0] == found[1] == found[2]
 
 
+def test_judging_leaves_the_threads_of_torch_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    torch.set_num_threads(2)
+    rows, T = scene(3)
+    judge = MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)
+    for _ in range(10):
+        judge(np.stack([T @ turned(k) for k in range(0, 180, 40)]))
+        seen: list[int] = []
+        fresh = threading.Thread(target=lambda seen=seen: seen.append(torch.get_num_threads()))
+        fresh.start()
+        fresh.join()
+        assert (torch.get_num_threads(), seen) == (2, [2])
+
+
 def turned(degrees: float) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()

@@ -336,6 +336,18 @@ def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
     )
 
 
+def test_confidence_rises_with_observability_and_falls_with_violation_up_to_a_bound() -> None:
+    for verdict in (None, 2.0):
+        sure = Evidence(0.5, 0.5, 0.3, 0.0, verdict)
+        by_hold = [confidence_score(sure, 3.0, 0.05, x) for x in (0.0, 0.005, 0.05, 0.3)]
+        assert np.isfinite(by_hold).all()
+        assert (np.diff(by_hold) > 0).all()
+        floating = [Evidence(0.5, 0.5, 0.3 * np.exp(10 * x), x, verdict) for x in (0.0, 0.02, 0.1, 0.4)]
+        by_violation = [confidence_score(e, 3.0, 0.05, 0.1) for e in floating]  # at equal surface score
+        assert (np.diff(by_violation[:3]) < 0).all()
+        assert by_violation[3] == pytest.approx(by_violation[2])
+
+
 def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:
     by_support = [confidence_score(evidence(0.2), 2.0, x, 0.1) for x in (0, 0.005, 0.02, 0.3)]
     by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05, 0.1) for x in (0.1, 0.3, 0.9)]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -56,6 +59,35 @@ def test_many_callers_share_the_helpers(three_threads):
     assert sums == [190 + 20 * k for k in range(40)]
 
 
+def test_a_thread_that_outlives_the_main_one_does_its_work_alone():
+    code = """
+import threading, time
+from geomoe3d.threads import each
+def late():
+    time.sleep(0.5)
+    print(each(lambda x: x + 1, range(4)))
+threading.Thread(target=late).start()
+"""
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.strip() == "[1, 2, 3, 4]", done.stderr
+
+
+def test_an_interrupt_begins_nothing_further(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    begun = []
+
+    def stop(x):
+        begun.append(x)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        each(stop, range(50))
+    assert len(begun) <= 2
+
+
 @pytest.mark.parametrize("given", ["", "none", "0", "-2"])
 def test_threads_without_a_usable_number_are_the_cores(monkeypatch, given):
     monkeypatch.setenv("OMP_NUM_THREADS", given)
@@ -72,5 +104,9 @@ def test_a_forked_process_has_helpers_of_its_own(three_threads):
     each(lambda x: x, range(3))
     child = os.fork()
     if child == 0:
-        os._exit(0 if threads.each(lambda x: x + 1, range(9)) == list(range(1, 10)) else 1)
+        try:
+            signal.alarm(20)  # no child may wait for helpers that it has not got
+            os._exit(0 if threads.each(lambda x: x + 1, range(9)) == list(range(1, 10)) else 1)
+        finally:
+            os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -25,7 +25,7 @@ from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.geomoe_filter import Insight, finite_rows, run_several
 from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, MotionInputs
-from geomoe3d.filters.one_thread import single_torch_thread
+from geomoe3d.filters.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.threads import each, single_blas_thread
 from geomoe3d.types import Correspondences, FloatArray, IntArray
@@ -163,6 +163,7 @@ class PairJudge:
         self._inputs, self._seen, self._num_rows = inputs, seen, num_rows
 
     @single_blas_thread()
+    @single_torch_thread()
     def __call__(self, motions: FloatArray, enough: float = np.inf) -> list[Judged]:
         """Judge motions, several at a time where there are threads.
 
@@ -184,8 +185,8 @@ class PairJudge:
                 found += [judged for part in each(self._judge, parts) for judged in part]
         return found
 
-    @single_torch_thread()
     def _judge(self, motions: FloatArray) -> list[Judged]:
+        helper_keeps_to_one_torch_thread()
         assert self._inputs is not None
         outputs = run_several(self._network, self._inputs.under(motions), self._device)
         return [

@@ -87,7 +87,8 @@ def spread(points: Floats, weights: Floats) -> FloatArray:
     Three directions of scatter decide a rigid fit: with the second at zero the rotation about the line is
     free. Returns (...) float64, 0 for no points or zero weights.
     """
-    w = weights / np.maximum(weights.sum(-1, keepdims=True), np.finfo(weights.dtype).tiny)
+    w = np.asarray(weights, dtype=np.float64)
+    w = w / np.maximum(w.sum(-1, keepdims=True), np.finfo(w.dtype).tiny)
     centred = points - np.einsum("...n,nd->...d", w, points)[..., None, :]
     covariance = np.einsum("...ni,...nj->...ij", centred * w[..., None], centred)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance.astype(np.float64))[..., 1], 0.0))

@@ -1,4 +1,4 @@
-"""Random changes of a training pair that keep its labels right.
+"""Random changes of a training pair that keep its labels right, or nearly so (`bend`).
 
 Clouds turned by any rotation and moved, roles exchanged, coordinates jittered, bent as a drifting sensor
 bends them, correspondences left out. Scale needs none: the network divides by the voxel size.
@@ -24,7 +24,10 @@ class AugmentationConfig(Section):
     swap: float = Field(0.5, ge=0, le=1, description="chance that source and target change roles")
     jitter: float = Field(0.1, ge=0, description="largest shift of a coordinate, in voxels")
     bend: float = Field(
-        0.0, ge=0, description="amplitude of a smooth bend of each cloud, in voxels: at most this, any below"
+        0.0,
+        ge=0,
+        description="largest amplitude of a smooth bend of the clouds, in voxels: three waves, each of it over the "
+        "root of three; labels stay those of the straight pair",
     )
 
 

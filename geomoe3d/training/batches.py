@@ -7,6 +7,7 @@ process r as its micro-batch m, so two processes do what one does with twice the
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +24,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.inputs import BatchInput, MotionInputs, PairInput, collate, pair_input
 from geomoe3d.geometry.se3 import rotation_error_deg
+from geomoe3d.threads import THREADS_VARIABLE
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
 from geomoe3d.training.fragment_pairs import FragmentPairs
@@ -269,4 +271,5 @@ def validation_samples(config: TrainConfig) -> list[Sample]:
 
 
 def _worker_init(_: int) -> None:
+    os.environ[THREADS_VARIABLE] = "1"  # this process alone
     torch.set_num_threads(1)

@@ -26,8 +26,8 @@ class AugmentationConfig(Section):
     bend: float = Field(
         0.0,
         ge=0,
-        description="largest amplitude of a smooth bend of the clouds, in voxels: three waves, each of it over the "
-        "root of three; labels stay those of the straight pair",
+        description="largest amplitude of a smooth bend of the clouds, in voxels: three waves, each of it "
+        "over root three; labels stay those of the straight pair",
     )
 
 

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.answer import Findings
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import check_motion, residuals, shift_frames
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import Refiner
@@ -36,13 +35,13 @@ _DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two motions are d
 class Refined(NamedTuple):
     """A motion (4, 4) in local coordinates, its evidence, and what went wrong if anything.
 
-    ``weighed`` is what the network said of the correspondences under it; None where it was not asked.
+    ``judged`` is what the network said under it; None where it was not asked.
     """
 
     T_target_source: FloatArray
     evidence: Evidence
     note: str | None
-    weighed: FilterOutput | None
+    judged: Judged | None
 
 
 class Chooser:
@@ -110,7 +109,8 @@ class Chooser:
         information = measure_information(T, source, target, self._threshold)
         support = self._support(T)
         judgement = judge(answer.evidence, lead, support, information, self._config.judgement, rival)
-        findings = Findings(T, other, lead, answer.evidence, information, judgement, answer.weighed)
+        weighed = None if answer.judged is None else answer.judged.output
+        findings = Findings(T, other, lead, answer.evidence, information, judgement, weighed)
         return findings if answer.note is None else findings.with_note(answer.note)
 
     def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
@@ -173,7 +173,7 @@ class Chooser:
             after = found.T_target_source.tobytes()
             judged = self._judged.get(after) or self._network(found.T_target_source[None])[0]
             evidence = replace(found.evidence, verdict=judged.verdict)
-            found = found._replace(evidence=evidence, weighed=judged.output)
+            found = found._replace(evidence=evidence, judged=judged)
             self._refined[key] = found
         return found
 

@@ -30,12 +30,13 @@ from multiprocessing import get_context
 from typing import Any, TypeVar
 
 from geomoe3d.errors import DependencyError, InputError, OutputError
+from geomoe3d.threads import THREADS_VARIABLE
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _MOST_DEATHS = 1
 _DIED = "the worker died over it several times, perhaps for lack of memory or by a fault of native code"
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREAD_VARIABLES = (THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ import numpy as np
 from geomoe3d.config import load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
 from geomoe3d.evaluation.calibration import calibration_error_of
-from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
+from geomoe3d.evaluation.measures import is_right, motion_errors
 from geomoe3d.judge import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, confidence_inputs
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
@@ -80,11 +80,7 @@ def measure(
                     continue
                 result = registrar.register(load_fragment(Path(source)), load_fragment(Path(target)))
                 found = result.T_target_source
-                right = T is not None and bool(
-                    np.isfinite(found).all()
-                    and rotation_error_deg(found, np.array(T)) < 15
-                    and translation_error(found, np.array(T)) < 0.3
-                )
+                right = T is not None and is_right(*motion_errors(found, np.array(T)))
                 names = [f.name for f in fields(Evidence) if f.name in result.evidence]
                 record = {
                     "scene": scene,

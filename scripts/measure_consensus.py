@@ -18,7 +18,7 @@ from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
 from geomoe3d.estimators.base import Estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
-from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
+from geomoe3d.evaluation.measures import is_right, motion_errors
 
 INLIER_THRESHOLD = 0.10
 
@@ -47,11 +47,7 @@ def main() -> None:
                 begin = time.perf_counter()
                 found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, seed=0)
                 seconds[name].append(time.perf_counter() - begin)
-                right = [
-                    rotation_error_deg(h.T_target_source, pair.T_target_source) < 15
-                    and translation_error(h.T_target_source, pair.T_target_source) < 0.30
-                    for h in found
-                ]
+                right = [is_right(*motion_errors(h.T_target_source, pair.T_target_source)) for h in found]
                 best[name] += bool(right and right[0])
                 anywhere[name] += any(right)
         for name in methods:

@@ -24,6 +24,7 @@ import numpy as np
 from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import BENCHMARKS, BenchmarkPair, load_benchmark
+from geomoe3d.evaluation.measures import is_right, motion_errors
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, translation_error
 from geomoe3d.registration import Registrar
 from geomoe3d.types import FloatArray
@@ -44,11 +45,6 @@ def kiss_matcher(voxel_size: float = 0.05) -> Peer | None:
         return make_transform(np.array(answer.rotation), np.array(answer.translation).ravel())
 
     return run
-
-
-def is_right(T: FloatArray, truth: FloatArray) -> bool:
-    """The benchmark's rule; a NaN transform is not right."""
-    return rotation_error_deg(T, truth) < 15 and translation_error(T, truth) < 0.30
 
 
 def main() -> None:
@@ -87,18 +83,20 @@ def measure(pair: BenchmarkPair, registrar: Registrar, peer: Peer | None) -> dic
         "scene": pair.scene,
         "pair": [pair.source_index, pair.target_index],
         "seconds": time.perf_counter() - begin,
-        "right": is_right(result.T_target_source, pair.T_target_source),
+        "right": is_right(*motion_errors(result.T_target_source, pair.T_target_source)),
         "rotation_error_deg": rotation_error_deg(result.T_target_source, pair.T_target_source),
         "translation_error": translation_error(result.T_target_source, pair.T_target_source),
         **facts(result),
     }
     other = result.alternative
-    row["alternative_right"] = other is not None and is_right(other.T_target_source, pair.T_target_source)
+    row["alternative_right"] = other is not None and is_right(
+        *motion_errors(other.T_target_source, pair.T_target_source)
+    )
     if peer is not None:
         begin = time.perf_counter()
         T = peer(*clouds)
         row["peer_seconds"] = time.perf_counter() - begin
-        row["peer_right"] = is_right(T, pair.T_target_source)
+        row["peer_right"] = is_right(*motion_errors(T, pair.T_target_source))
     return row
 
 

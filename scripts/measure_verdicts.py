@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.evaluation.calibration import auroc_of
+from geomoe3d.evaluation.measures import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
 from geomoe3d.filters.motion_judge import MotionJudge
-from geomoe3d.geometry.se3 import residuals, rotation_error_deg, translation_error
+from geomoe3d.geometry.se3 import residuals
 from geomoe3d.types import BoolArray, Correspondences, FloatArray
 
 FIRST, MOST = 8, 20
@@ -45,9 +46,7 @@ def main() -> None:
                 continue
             motions = np.array([h.T_target_source for h in found])
             truth = pair.T_target_source
-            right = np.array(
-                [rotation_error_deg(T, truth) < 15 and translation_error(T, truth) < 0.3 for T in motions]
-            )
+            right = np.array([is_right(*motion_errors(T, truth)) for T in motions])
             labels = residuals(truth, pair.points[:, :3], pair.points[:, 3:]) < INLIER_THRESHOLD
             given_rows = Correspondences(pair.points, viewpoints=AT_ZERO)
             for name, judge in judges.items():
@@ -56,18 +55,12 @@ def main() -> None:
                 seen[name].append((right, verdicts))
                 logits = judged[int(verdicts.argmax())].output.logits
                 assert logits is not None
-                f1[name].append(f1_of(labels, logits > 0))
+                f1[name].append(precision_recall_f1(logits > 0, labels)[2])
         for name in judges:
             everything[name] += seen[name]
             print(f"{benchmark}, {name}: {summary(seen[name])}, F1 {np.mean(f1[name]):.3f}")
     for name in judges:
         print(f"both, {name}: {summary(everything[name])}")
-
-
-def f1_of(labels: BoolArray, kept: BoolArray) -> float:
-    """Of one pair, 0 where undefined."""
-    both = int((labels & kept).sum())
-    return 2 * both / max(int(labels.sum() + kept.sum()), 1)
 
 
 def summary(seen: list[tuple[BoolArray, FloatArray]]) -> str:

@@ -4,7 +4,7 @@ In evaluation batch norms are affine maps and disappear into their neighbours. I
 N correspondences and M sub-fields the N side is never projected: queries, keys and values of the M side are
 multiplied into the weights first, so per layer only six products run over all correspondences. Constants
 that a softmax cancels are dropped. Logits agree with `GeoMoE` to 1e-4; tests hold it to that. Linear in N.
-Several motions at a time cost less than one after the other where threads share an interpreter.
+Several motions at a time hold the interpreter less, so that threads stand in each other's way less.
 """
 
 from __future__ import annotations

@@ -60,7 +60,8 @@ def stage_display(quiet: bool) -> Iterator[Callable[[str], None]]:
         redirect_stderr=False,
     ) as progress:
         task = progress.add_task("start", total=None)
-        yield lambda stage: progress.update(task, description=stage)
+        # drawn at once: stages can be shorter than the time between two drawings
+        yield lambda stage: progress.update(task, description=stage, refresh=True)
 
 
 @contextmanager

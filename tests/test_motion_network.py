@@ -142,7 +142,8 @@ def network(**changes: object) -> GeoMoE:
 def test_folded_network_gives_the_same_verdict(changes: dict[str, object]) -> None:
     model = network(**changes)
     rows, T = scene(1)
-    inputs = MotionInputs(rows, AT_ZERO, VOXEL, model.config).under(np.stack([T, np.eye(4)]))
+    nowhere = make_transform(np.eye(3), np.full(3, 100.0))  # brings nothing together: all rejected at first
+    inputs = MotionInputs(rows, AT_ZERO, VOXEL, model.config).under(np.stack([T, np.eye(4), nowhere]))
     batch = collate(inputs)
     with torch.no_grad():
         plain = model(batch.coordinates, batch.channels, batch.neighbors)

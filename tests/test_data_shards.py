@@ -19,7 +19,7 @@ from geomoe3d.clouds.io import save_points
 from geomoe3d.data import shards as module
 from geomoe3d.data.describe import describe_collection
 from geomoe3d.data.draw import DrawSettings, FragmentPool
-from geomoe3d.data.shards import DescribedScene, open_shard, write_shard
+from geomoe3d.data.shards import DescribedScene, open_shard, shard_folders, write_shard
 from geomoe3d.data.statistics import by_band, distance, measure, plane_share
 from geomoe3d.data.threedmatch import write_gt_log
 from geomoe3d.errors import FormatError, InputError, OutputError
@@ -302,6 +302,11 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(geomoe3d, "geomoe3d", arguments) == 0
     assert "1 shards made (3 fragments, 3 pairs)" in capsys.readouterr().out
     assert run(geomoe3d, "geomoe3d", [*arguments, "--group", "train_info"]) == 2
+    assert run(geomoe3d, "geomoe3d", [*arguments[:3], str(tmp_path / "coarse"), "--voxel-size", "0.1"]) == 0
+    fine, coarse = (open_shard(shard_folders(tmp_path / name)[0]) for name in ("out", "coarse"))
+    assert (fine.voxel_size, coarse.voxel_size) == (0.05, 0.1)
+    assert 0 < len(coarse.points) < 0.5 * len(fine.points)
+    capsys.readouterr()
     (tmp_path / "posed" / "a" / "cloud_bin_1.ply").write_text("broken")
     alone = ["data", "features", str(tmp_path / "posed"), str(tmp_path / "none"), "--min-overlap", "2"]
     assert run(geomoe3d, "geomoe3d", alone) == 2

@@ -166,6 +166,18 @@ def test_shards_give_back_what_was_written(tmp_path: Path) -> None:
         write_shard(tmp_path / "a", pairs)
 
 
+def test_shards_may_lie_in_subfolders(tmp_path: Path) -> None:
+    pairs = [SyntheticPairs(SyntheticConfig(correspondences=(20, 60)))[i] for i in range(3)]
+    for name, pair in zip(("b", "rooms/a", "scans/a"), pairs, strict=True):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_shard(tmp_path / name, [pair])
+    folder = ShardFolder(tmp_path)
+    assert [equal(folder[i], pairs[i]) for i in range(3)] == [True] * 3
+    before = folder.identity()
+    (tmp_path / "scans").rename(tmp_path / "tripod")
+    assert ShardFolder(tmp_path).identity() != before
+
+
 def test_shards_carry_optional_channels(tmp_path: Path) -> None:
     pair = SyntheticPairs(SyntheticConfig(correspondences=(20, 60)))[0]
     mutual = np.arange(len(pair)) % 3 == 0

@@ -223,6 +223,13 @@ def synthesize(
     help="Take the scenes of a published split of 3DMatch alone (default: all scenes).",
 )
 @click.option("--min-overlap", default=0.1, show_default=True, help="Least overlap of a pair.")
+@click.option(
+    "--voxel-size",
+    default=0.05,
+    show_default=True,
+    type=click.FloatRange(min=0, min_open=True),
+    help="Grid of the described points, in the fragments' unit.",
+)
 @click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
 @traceback_option
 @click.pass_context
@@ -234,6 +241,7 @@ def features(
     scenes: tuple[str, ...],
     split: str | None,
     min_overlap: float,
+    voxel_size: float,
     workers: int,
 ) -> None:
     """Describe the fragments of ROOT once, into the shards OUT that training reads.
@@ -252,6 +260,7 @@ def features(
             scenes=scenes or None,
             split=split,
             min_overlap=min_overlap,
+            voxel_size=voxel_size,
             workers=workers,
             progress=advance,
         )

@@ -159,21 +159,22 @@ def fuse_run(
 
 
 def relate(
-    clouds: list[FloatArray], poses: list[FloatArray], min_overlap: float
+    clouds: list[FloatArray], poses: list[FloatArray], min_overlap: float, grid: float = 0.025
 ) -> tuple[PairTable, dict[tuple[int, int], float]]:
     """Entries of gt.log, and the overlap of every pair i < j that has any.
 
     Args:
-        clouds: (n, 3) thinned to 2.5 cm, each in its own frame.
+        clouds: (n, 3) thinned to ``grid``, each in its own frame.
         poses: T_world_fragment (4, 4) of each.
         min_overlap: least overlap of an entry.
+        grid: points within one and a half of it are the same place; 2.5 cm is the benchmark's.
     """
     entries: PairTable = []
     overlaps: dict[tuple[int, int], float] = {}
     for i in range(len(clouds)):
         for j in range(i + 1, len(clouds)):
             T_i_j = inverse(poses[i]) @ poses[j]
-            share = measure_overlap(clouds[i], clouds[j], inverse(T_i_j))
+            share = measure_overlap(clouds[i], clouds[j], inverse(T_i_j), 1.5 * grid)
             if share > 0:
                 overlaps[i, j] = share
             if share >= min_overlap:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from geomoe3d.config import Section
@@ -23,6 +25,11 @@ class SceneShares(Section):
 class SynthesisSettings(Section):
     """Generated scenes and the fragments recorded in them."""
 
+    recorder: Literal["camera", "scanner", "orbit"] = Field(
+        "camera",
+        description="what records: a depth camera that is carried about; laser scanners, spinning and on "
+        "tripods, from places metres apart; or, for orbit, a camera around a single body",
+    )
     fragments_per_scene: int = Field(12, ge=2, description="fragments recorded per scene")
     frames_per_fragment: int = Field(
         12, ge=2, description="depth frames fused into one; stand for 50 recorded ones"

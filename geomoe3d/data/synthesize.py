@@ -172,7 +172,11 @@ def make_scene(job: Job, number: int) -> SceneSummary:
     scene = choose_scene(rng, job.settings, library, list(job.meshes))
     recorded = record(rng, scene, job.settings)
     entries, overlaps = relate(
-        [cloud.astype(np.float64) for cloud in recorded.clouds], recorded.poses, job.settings.min_overlap
+        [cloud.astype(np.float64) for cloud in recorded.clouds],
+        recorded.poses,
+        job.settings.min_overlap,
+        # What a camera saw at one place is compared as the benchmark does, whatever the points kept.
+        job.settings.grid if job.settings.recorder == "scanner" else 0.025,
     )
     summary = SceneSummary(
         number,
@@ -297,7 +301,7 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
                 found = json.loads(path.read_text())
             except ValueError as error:
                 raise InputError(f"'{path}' is damaged ({error}); give a new folder") from None
-            differing = _differences(found, manifest)
+            differing = _differences(_completed(found), manifest)
             if differing:
                 reasons = "; ".join(differing)
                 raise InputError(
@@ -314,6 +318,14 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
         if isinstance(error, OutputError):
             raise
         raise OutputError(f"cannot write into '{folder}': {error.strerror or error}") from None
+
+
+def _completed(manifest: Any) -> Any:
+    """Settings that a folder made by an earlier version does not name had their defaults then."""
+    if isinstance(manifest, dict) and isinstance(manifest.get("settings"), dict):
+        defaults = SynthesisSettings().model_dump(mode="json")
+        return {**manifest, "settings": {**defaults, **manifest["settings"]}}
+    return manifest
 
 
 def _put(path: Path, text: str) -> None:

@@ -30,7 +30,7 @@ from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 NUM_MOTIONS = 24
 PAIRS_PER_SHARD = 100
 SETTINGS = DrawSettings(
-    usual_share=0.85, keypoints=(500, 2000), band_shares=(0.5, 0.3, 0.2), min_inliers=0, whole_share=0.4
+    usual_share=0.7, keypoints=(250, 2000), band_shares=(0.5, 0.3, 0.2), min_inliers=0, whole_share=0.4
 )
 """Hard pairs most often, matched as benchmarks do and as registration does; pairs without a right motion
 among those proposed teach to doubt."""

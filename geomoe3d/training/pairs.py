@@ -82,8 +82,16 @@ class PairDataset(Protocol):
         """Least and largest voxel size of its pairs; stored in weight cards."""
 
 
+def _visible(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+
+
+def _is_shard(path: Path) -> bool:
+    return (path.is_dir() and (path / "start.npy").is_file()) or path.suffix == ".npz"
+
+
 class ShardFolder:
-    """Pairs of a folder of shards, in the order of the shards' names.
+    """Pairs of a folder of shards, or of its subfolders, in the order of the shards' names.
 
     A shard is a folder of ``.npy`` files (mapped, recommended for large data) or one ``.npz`` file (loaded
     whole at first use) with ``correspondences`` (sum N, 6) float32, ``start`` (P+1,) row offsets,
@@ -100,12 +108,17 @@ class ShardFolder:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise InputError(f"training data '{self.folder}' is not a folder; give a folder of shards")
-        entries = sorted(p for p in self.folder.iterdir() if not p.name.startswith("."))
+        entries = _visible(self.folder)
         self._paths = [
-            p for p in entries if (p.is_dir() and (p / "start.npy").is_file()) or p.suffix == ".npz"
+            shard
+            for entry in entries
+            for shard in ([entry] if _is_shard(entry) else _visible(entry) if entry.is_dir() else [])
+            if _is_shard(shard)
         ]
         if not self._paths:
-            raise InputError(f"'{self.folder}' holds no shard (a folder with start.npy, or a .npz file)")
+            raise InputError(
+                f"'{self.folder}' and its subfolders hold no shard (a folder with start.npy, or a .npz file)"
+            )
         self._open: dict[int, dict[str, NDArray[Any]]] = {}
         counts = [len(_read(path, ("start",))["start"]) - 1 for path in self._paths]
         self._first = np.concatenate([[0], np.cumsum(counts)])
@@ -138,7 +151,7 @@ class ShardFolder:
         """Hash of the shards' names, sizes and offsets."""
         digest = hashlib.sha256()
         for path in self._paths:
-            digest.update(path.name.encode())
+            digest.update(path.relative_to(self.folder).as_posix().encode())
             digest.update(_read(path, ("start",))["start"].astype(np.int64).tobytes())
             files = sorted(path.iterdir()) if path.is_dir() else [path]
             digest.update(json.dumps([[f.name, f.stat().st_size] for f in files]).encode())

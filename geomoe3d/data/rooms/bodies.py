@@ -21,7 +21,8 @@ from geomoe3d.types import FloatArray
 
 _DIAGONAL = (1.8, 5.0)
 _KINDS = ("piece", "pile", "grown")
-_SHARES = (0.25, 0.25, 0.5)
+_SHARES = (0.15, 0.3, 0.55)
+_LEFT_OUT = {"picture", "table"}  # boards and tables look the same turned by half
 
 
 def generate_body(rng: np.random.Generator, library: ModelLibrary | None) -> tuple[str, Solids]:
@@ -49,11 +50,11 @@ def any_attitude(rng: np.random.Generator) -> FloatArray:
 
 def _piece(rng: np.random.Generator, library: ModelLibrary | None) -> Solids:
     if library is not None and rng.random() < 0.7:
-        kinds = sorted(library.models)
+        kinds = sorted(set(library.models) - _LEFT_OUT)
         found = library.draw(kinds[int(rng.integers(len(kinds)))], rng)
         if found is not None:
             return found.solids
-    makers = sorted(MAKERS)
+    makers = sorted(set(MAKERS) - _LEFT_OUT)
     return MAKERS[makers[int(rng.integers(len(makers)))]](rng).solids
 
 

@@ -6,9 +6,10 @@
 Every case is asked with and without the network, the same pairs in the same order. One line per pair goes
 to OUT.
 
-- counts: 250 to 5,000 keypoints drawn in each fragment of the dev half at 5 cm, nearest neighbours source to
-  target; recall of consensus alone and of the network on its motions.
-- ratios: the fixed 1,000 correspondences, by their share of inliers; for high shares outliers are left out.
+- counts: 250 to 5,000 keypoints drawn in each fragment of the dev half at 5 cm, all where it has fewer,
+  nearest neighbours source to target; recall of consensus alone and of the network on its motions.
+- ratios: the fixed 1,000 correspondences, by their share of inliers; for 70 and 90 % outliers are left out,
+  where 20 inliers or more are there, which leaves few correspondences.
 - voxels: `register` on the fragments of the dev half with a fixed voxel size.
 - scans: `register` on laser scans taken in two scene meshes and in generated flats, spinning and on a tripod,
   1 to 8 m apart.
@@ -19,8 +20,10 @@ to OUT.
   runs/fine-rooms grid=0.01 --scenes 10 --seed 777 --models FOLDER`.
 
 Right: within 15 degrees and 30 cm; for objects within 15 degrees and a tenth of the diagonal. Scans and
-objects are simulated (no recorded ones are at hand). Scene meshes and furniture models also served to make
-the training set, the bodies did not.
+objects are simulated (no recorded ones are at hand), by the scanners and the camera of `geomoe3d data
+synthesize`; scene meshes and furniture models also served to make training sets, the bodies did not. `size`
+is the median number of correspondences or of points of the smaller cloud, `ok` is what `register` says with
+the network.
 """
 
 from __future__ import annotations
@@ -72,9 +75,9 @@ RATIOS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
 MIXED = (0.7, 0.9)
 SIZES = (1.0, 0.1, 100.0)
 BODIES = (
-    "armadillo", "bear", "boeing", "bones", "bull", "bunny00", "camel", "couplingdown", "cow", "dino",
+    "armadillo", "bear", "boeing", "bones", "bull", "bunny00", "camel", "cow", "dino",
     "diplodocus", "elephant", "elk", "fandisk_large", "femur", "hand", "head", "homer", "joint", "lion",
-    "lion-head", "man", "mannequin-devil", "mech-holes-shark", "nefertiti", "pig", "triceratops", "turbine",
+    "lion-head", "man", "mannequin-devil", "mech-holes-shark", "nefertiti", "pig", "triceratops",
 )  # fmt: skip
 
 
@@ -117,20 +120,27 @@ def main() -> None:
     weights = [] if given.weights is None else [f"filter.weights={given.weights}"]
     ways = {"without": ["filter.name=none"], "network": ["filter.name=geomoe", *weights]}
     print(
-        "| case | pairs | right: without / network | only without / only network | ok | right of ok "
+        "| case | pairs | size | right: without / network | only without / only network | ok | right of ok "
         "| median ms: without / network |"
     )
-    print("|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|")
     with given.out.open("a", encoding="utf-8") as stream:
         for part in given.parts or PARTS:
             rows: dict[str, list[dict[str, Any]]] = {}
             for case in PARTS[part](given):
-                row = {"part": part, "condition": case.condition, "pair": case.name}
-                row |= {way: ask(case, tuple(settings)) for way, settings in ways.items()}
-                stream.write(json.dumps(row) + "\n")
+                row = {"part": part, "condition": case.condition, "pair": case.name, "size": size_of(case)}
+                row |= {"weights": given.weights, "every": given.every, "pairs": given.pairs}
+                order = list(ways) if len(rows.get(case.condition, [])) % 2 else list(ways)[::-1]
+                row |= {way: ask(case, tuple(ways[way])) for way in order}
+                stream.write(json.dumps(row, allow_nan=False) + "\n")
                 rows.setdefault(case.condition, []).append(row)
             for condition in sorted(rows):
                 print(table_row(part, condition, rows[condition]), flush=True)
+
+
+def size_of(case: Case) -> int:
+    """Number of correspondences, or points of the smaller cloud."""
+    return min(map(len, case.given))
 
 
 def table_row(part: str, condition: str, rows: list[dict[str, Any]]) -> str:
@@ -143,15 +153,18 @@ def table_row(part: str, condition: str, rows: list[dict[str, Any]]) -> str:
     times = " / ".join(
         f"{1000 * statistics.median(row[way]['seconds'] for row in rows):.0f}" for way in right
     )
-    return f"| {part} {condition} | {len(rows)} | {shares} | {only} | {said} | {times} |"
+    size = f"{statistics.median(row['size'] for row in rows):.0f}"
+    return f"| {part} {condition} | {len(rows)} | {size} | {shares} | {only} | {said} | {times} |"
 
 
 def ask(case: Case, settings: tuple[str, ...]) -> dict[str, Any]:
     """What came out for a case."""
-    begin = time.perf_counter()
     T: FloatArray | None
+    register = registrar((*settings, *case.settings)).register  # weights are read before the clock starts
+    parts_of(settings)
+    begin = time.perf_counter()
     if len(case.given) == 2:
-        result = registrar((*settings, *case.settings)).register(*case.given)
+        result = register(*case.given)
         T, said = result.T_target_source, {"status": result.status, "confidence": result.confidence}
         said["voxel_size"] = result.voxel_size
     else:
@@ -160,8 +173,8 @@ def ask(case: Case, settings: tuple[str, ...]) -> dict[str, Any]:
     turn, way = motion_errors(T, case.truth)
     return {
         "right": bool(turn < 15 and way < case.tolerance),
-        "turn": turn,
-        "way": way,
+        "turn": turn if np.isfinite(turn) else None,
+        "way": way if np.isfinite(way) else None,
         "seconds": seconds,
         **said,
     }
@@ -270,6 +283,7 @@ def scans(given: argparse.Namespace) -> Iterator[Case]:
                 if measure_overlap(coarse[0], coarse[1], truth, 0.15) > 0.3:
                     break
             else:
+                print(f"no two places in {place.name}", flush=True)
                 continue
             for size in (None, 0.1, 0.3):
                 fixed = () if size is None else (f"voxel_size={size}",)
@@ -289,7 +303,7 @@ def objects(given: argparse.Namespace) -> Iterator[Case]:
     for number, name in enumerate(2 * BODIES):
         rng = np.random.default_rng([number, 7])
         scene, diagonal = standing(files[name], rng)
-        while True:
+        for _ in range(100):
             first, pitch = rng.uniform(0, 360), rng.normal(0, 25)
             turn = float(rng.choice([-1, 1]) * rng.uniform(25, 75))
             views, poses = [], []
@@ -304,6 +318,9 @@ def objects(given: argparse.Namespace) -> Iterator[Case]:
             truth = inverse(poses[1]) @ poses[0]
             if measure_overlap(views[0], views[1], truth, 0.02 * diagonal) > 0.4:
                 break
+        else:
+            print(f"no two views of {name} overlap", flush=True)
+            continue
         for size in SIZES:
             scaled = truth.copy()
             scaled[:3, 3] *= size / diagonal
@@ -325,7 +342,7 @@ def standing(file: Path, rng: np.random.Generator) -> tuple[Any, float]:
 def fine(given: argparse.Namespace) -> Iterator[Case]:
     """Generated fragments, kept at 1 cm, on a grid of 2 cm beside one of 5 cm."""
     pairs = open_collection(given.fine).pairs
-    chosen = np.random.default_rng(0).permutation(len(pairs))[: 2 * given.pairs]
+    chosen = np.random.default_rng(0).permutation(len(pairs))[: given.pairs]
     for pair in (pairs[k] for k in chosen):
         clouds = load_fragment(pair.source), load_fragment(pair.target)
         for size in (0.02, 0.05):

@@ -5,15 +5,19 @@
 #   scripts/wider_set.sh [SET] [OUT] [WORKERS]
 #
 # SET: what scripts/training_set.sh made, default runs/training-set; gets scans, bodies and further descriptions.
-# OUT: default runs/motions, a folder per part; give it as data.train. Started again, it goes on.
+# OUT: default runs/wider-motions, a folder per part; give it as data.train. Started again, it goes on.
 # Needs the models of Debian's package sweethome3d-furniture (or GEOMOE3D_MODELS).
 set -euo pipefail
 
 set=${1:-runs/training-set}
-out=${2:-runs/motions}
+out=${2:-runs/wider-motions}
 workers=${3:-$(nproc)}
 models=${GEOMOE3D_MODELS:-/usr/share/sweethome3d/furniture}
 
+if ! command -v geomoe3d >/dev/null; then
+  echo "no geomoe3d on the PATH; activate the environment it is installed in (. .venv/bin/activate)" >&2
+  exit 2
+fi
 if [ ! -d "$set/features" ]; then
   echo "'$set' holds no described fragments; scripts/training_set.sh $set makes them" >&2
   exit 2

@@ -307,6 +307,8 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (fine.voxel_size, coarse.voxel_size) == (0.05, 0.1)
     assert 0 < len(coarse.points) < 0.5 * len(fine.points)
     capsys.readouterr()
+    assert run(geomoe3d, "geomoe3d", [*arguments[:3], str(tmp_path / "x"), "--voxel-size", "inf"]) == 2
+    assert "found inf" in capsys.readouterr().err
     (tmp_path / "posed" / "a" / "cloud_bin_1.ply").write_text("broken")
     alone = ["data", "features", str(tmp_path / "posed"), str(tmp_path / "none"), "--min-overlap", "2"]
     assert run(geomoe3d, "geomoe3d", alone) == 2

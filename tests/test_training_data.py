@@ -168,7 +168,7 @@ def test_shards_give_back_what_was_written(tmp_path: Path) -> None:
 
 def test_shards_may_lie_in_subfolders(tmp_path: Path) -> None:
     pairs = [SyntheticPairs(SyntheticConfig(correspondences=(20, 60)))[i] for i in range(3)]
-    for name, pair in zip(("b", "rooms/a", "scans/a"), pairs, strict=True):
+    for name, pair in zip(("a/b", "rooms/a", "scans/a"), pairs, strict=True):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         write_shard(tmp_path / name, [pair])
     folder = ShardFolder(tmp_path)
@@ -176,6 +176,9 @@ def test_shards_may_lie_in_subfolders(tmp_path: Path) -> None:
     before = folder.identity()
     (tmp_path / "scans").rename(tmp_path / "tripod")
     assert ShardFolder(tmp_path).identity() != before
+    write_shard(tmp_path / "loose", pairs[:1])
+    with pytest.raises(InputError, match=r"'loose'.*'a'.*keep them apart"):
+        ShardFolder(tmp_path)
 
 
 def test_shards_carry_optional_channels(tmp_path: Path) -> None:

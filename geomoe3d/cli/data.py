@@ -173,9 +173,10 @@ def synthesize(
 ) -> None:
     """Generate furnished rooms and record fragments in them, into the folder OUT.
 
-    Rooms come from simple solids alone unless --models or --mesh give more. Same seed, settings and
-    material: same bytes, whatever the number of workers. Started again, an interrupted run goes on. OUT
-    gets scene-NNNNN folders (cloud_bin_N.ply, gt.log), report.md and contact.png.
+    recorder=scanner takes laser scans instead, recorder=orbit views of single bodies. Rooms come from
+    simple solids alone unless --models or --mesh give more. Same seed, settings and material: same bytes,
+    whatever the number of workers. Started again, an interrupted run goes on. OUT gets scene-NNNNN folders
+    (cloud_bin_N.ply, gt.log), report.md and contact.png.
     """
     from pathlib import Path
 

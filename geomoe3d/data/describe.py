@@ -1,7 +1,7 @@
 """From posed fragments of any layout to shards of described ones: the step that is done once.
 
-Points, normals and features are those of registration itself (5 cm voxels, normals turned to the sensor,
-L2-normalised FPFH). About 0.2 s per fragment on one core.
+Points, normals and features are those of registration itself (voxels of 5 cm unless told, normals turned
+to the sensor, L2-normalised FPFH). About 0.2 s per fragment on one core.
 """
 
 from __future__ import annotations
@@ -88,10 +88,13 @@ def describe_collection(
         progress: called with (scenes done, scenes in all).
 
     Raises:
-        InputError: the layout is unknown, or no pair is left, or there is no worker.
+        InputError: the layout is unknown, no pair is left, there is no worker, or the voxel size is not
+            positive and finite.
         FormatError: a shard in the folder is damaged or stale; the message says why.
         OutputError: the disk refuses.
     """
+    if not (np.isfinite(voxel_size) and voxel_size > 0):
+        raise InputError(f"the voxel size must be a positive length, found {voxel_size}")
     collection = open_collection(root)
     folder = Path(folder)
     try:

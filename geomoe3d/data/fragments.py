@@ -164,7 +164,7 @@ def relate(
     """Entries of gt.log, and the overlap of every pair i < j that has any.
 
     Args:
-        clouds: (n, 3) thinned to ``grid``, each in its own frame.
+        clouds: (n, 3) thinned to ``grid`` or finer, each in its own frame.
         poses: T_world_fragment (4, 4) of each.
         min_overlap: least overlap of an entry.
         grid: points within one and a half of it are the same place; 2.5 cm is the benchmark's.

@@ -42,7 +42,7 @@ class SynthesisSettings(Section):
     grid: float = Field(0.025, gt=0, description="one point is kept per cell of this edge, metres")
     drift_metres: float = Field(0.008, ge=0, description="error of the tracked position after a fragment")
     drift_deg: float = Field(0.25, ge=0, description="error of each tracked angle after a fragment")
-    min_points: int = Field(3000, ge=100, description="fragments with fewer points are recorded elsewhere")
+    min_points: int = Field(3000, ge=100, description="fragments with fewer points are left out")
     min_overlap: float = Field(0.1, ge=0, le=1, description="least overlap of a pair in gt.log")
     relief: ReliefSettings = ReliefSettings()
     sensor: SensorSettings = SensorSettings()

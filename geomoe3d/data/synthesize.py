@@ -132,6 +132,8 @@ def synthesize(
     missing = [path for path in job.meshes if not Path(path).is_file()]
     if missing:
         raise InputError(f"scene mesh '{missing[0]}' does not exist")
+    if job.meshes and job.settings.recorder == "orbit":
+        raise InputError("recorder=orbit looks at single bodies and takes no scene meshes; leave them out")
     for path in job.meshes:
         load_mesh_scene(path)  # now, not hours later, when the folder is bound to this file
     library = _open_library(job)
@@ -321,10 +323,9 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
 
 
 def _completed(manifest: Any) -> Any:
-    """Settings that a folder made by an earlier version does not name had their defaults then."""
+    """A folder that names no recorder was made when there was the camera alone."""
     if isinstance(manifest, dict) and isinstance(manifest.get("settings"), dict):
-        defaults = SynthesisSettings().model_dump(mode="json")
-        return {**manifest, "settings": {**defaults, **manifest["settings"]}}
+        return {**manifest, "settings": {"recorder": "camera", **manifest["settings"]}}
     return manifest
 
 

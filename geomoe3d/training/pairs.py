@@ -100,7 +100,7 @@ class ShardFolder:
     (P+1,), and ``viewpoints`` (P, 2, 3).
 
     Raises:
-        InputError: the folder is missing or holds no shard.
+        InputError: the folder is missing, holds no shard, or holds shards beside folders of shards.
         FormatError: a shard lacks an array, or its arrays do not fit together.
     """
 
@@ -109,12 +109,15 @@ class ShardFolder:
         if not self.folder.is_dir():
             raise InputError(f"training data '{self.folder}' is not a folder; give a folder of shards")
         entries = _visible(self.folder)
-        self._paths = [
-            shard
-            for entry in entries
-            for shard in ([entry] if _is_shard(entry) else _visible(entry) if entry.is_dir() else [])
-            if _is_shard(shard)
-        ]
+        flat = [entry for entry in entries if _is_shard(entry)]
+        parts = [entry for entry in entries if entry.is_dir() and not _is_shard(entry)]
+        nested = [shard for part in parts for shard in _visible(part) if _is_shard(shard)]
+        if flat and nested:
+            raise InputError(
+                f"'{self.folder}' holds shards ('{flat[0].name}') and a folder of shards "
+                f"('{nested[0].parent.name}'); keep them apart, lest data of two origins mix"
+            )
+        self._paths = flat or nested
         if not self._paths:
             raise InputError(
                 f"'{self.folder}' and its subfolders hold no shard (a folder with start.npy, or a .npz file)"

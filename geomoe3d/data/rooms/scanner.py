@@ -14,6 +14,7 @@ import numpy as np
 
 from geomoe3d.config import Section
 from geomoe3d.data.rooms.scenes import Scene
+from geomoe3d.data.rooms.walk import floor_below
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray
 
@@ -93,7 +94,7 @@ class LaserScanner:
 def stand_scanner(rng: np.random.Generator, scene: Scene, count: int) -> list[FloatArray]:
     """Poses T_world_sensor (4, 4) of a scanner that stands nearly upright, turned anyhow.
 
-    Each is 1 to 8 m from one before, 1.2 to 1.7 m above the ground level z = 0, with nothing within 40 cm.
+    Each is 1 to 8 m from one before, 1.2 to 1.7 m above the floor, with nothing within 40 cm.
     Fewer than ``count`` where the scene has no more place.
     """
     import open3d as o3d
@@ -104,7 +105,11 @@ def stand_scanner(rng: np.random.Generator, scene: Scene, count: int) -> list[Fl
         if len(eyes) == count:
             break
         x0, y0, x1, y1 = scene.areas[int(rng.integers(len(scene.areas)))]
-        eye = np.array([*rng.uniform([x0, y0], [x1, y1]), rng.uniform(*_HEIGHT)])
+        x, y, height = (float(v) for v in (*rng.uniform([x0, y0], [x1, y1]), rng.uniform(*_HEIGHT)))
+        floor = floor_below(scene, x, y)
+        if floor is None:
+            continue
+        eye = np.array([x, y, floor + height])
         near = eyes[int(rng.integers(len(eyes)))] if eyes else None
         if near is not None and not _APART[0] < float(np.linalg.norm(eye - near)) < _APART[1]:
             continue

@@ -167,7 +167,7 @@ def _propose(
         x, y = last.eye[:2] + way * np.array([np.cos(angle), np.sin(angle)])
         yaw = last.yaw + float(rng.normal(0, settings.turn_deg))
         pitch = float(np.clip(last.pitch + rng.normal(0, 8), -65, 25))
-    floor = _floor_below(scene, float(x), float(y))
+    floor = floor_below(scene, float(x), float(y))
     if floor is None:
         return None
     eye = np.array([x, y, floor + rng.uniform(*settings.height)])
@@ -179,7 +179,8 @@ def _propose(
     return Stand(eye, yaw, pitch, float(rng.normal(0, 5)))
 
 
-def _floor_below(scene: Scene, x: float, y: float) -> float | None:
+def floor_below(scene: Scene, x: float, y: float) -> float | None:
+    """Height of the floor at a place; None outside the areas and where nobody could stand."""
     inside = any(x0 < x < x1 and y0 < y < y1 for x0, y0, x1, y1 in scene.areas)
     if not inside:
         return None

@@ -18,7 +18,8 @@ from geomoe3d.clouds.formats import arrays, e57, las, meshes, objects, pcd, ply,
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, NonFiniteError
-from geomoe3d.types import BoolArray, FloatArray, PointCloud
+from geomoe3d.geometry.columns import finite_rows
+from geomoe3d.types import FloatArray, PointCloud
 
 MAX_COORDINATE = 1e12
 DENSE_MESH_VERTICES = 50_000
@@ -170,7 +171,7 @@ def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
     num_points = len(raw.points)
     if not num_points:
         raise EmptyCloudError(f"{what} holds 0 points; at least 1 is needed")
-    finite: BoolArray = np.asarray(np.isfinite(raw.points).all(axis=1))
+    finite = finite_rows(raw.points)
     num_non_finite = num_points - int(np.count_nonzero(finite))
     if num_non_finite == num_points:
         raise NonFiniteError(f"{what}: all {num_points} points have a NaN or infinite coordinate")

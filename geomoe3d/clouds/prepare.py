@@ -12,6 +12,7 @@ import numpy as np
 from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
+from geomoe3d.geometry.columns import extents, largest_of_rows
 from geomoe3d.threads import each, usable_threads
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
@@ -20,6 +21,7 @@ _MIN_POINTS = 3
 _MAX_EXTENT_RATIO = 50
 _CLOSE_COUNT = 0.01  # half a percent of the voxel size, which is rounded to two digits
 _SPACING_POINTS = 20_000
+_BITS = 21  # of a 64-bit voxel key, for each axis
 
 
 def prepare(
@@ -102,7 +104,7 @@ def check_cloud(cloud: PointCloud) -> None:
         raise EmptyCloudError(
             f"'{cloud.name}' holds {len(cloud)} points; a rigid motion needs at least {_MIN_POINTS}"
         )
-    if not np.ptp(cloud.points, axis=0).any():
+    if not extents(cloud.points).any():
         raise EmptyCloudError(
             f"'{cloud.name}': all {len(cloud)} points are equal to {cloud.file_points[0].tolist()}; "
             "they fix no rotation"
@@ -114,7 +116,7 @@ def robust_extent(points: FloatArray) -> float:
     sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
     low, high = np.percentile(sample, [1, 99], axis=0)
     extent = float(np.linalg.norm(high - low))
-    return extent if extent > 0 else float(np.linalg.norm(np.ptp(points, axis=0)))
+    return extent if extent > 0 else float(np.linalg.norm(extents(points)))
 
 
 def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float, max_points: int) -> float:
@@ -172,7 +174,7 @@ def typical_spacing(points: FloatArray) -> float:
     from scipy.spatial import cKDTree
 
     # All points of a part keep their density; a thinned cloud would look sparser than it is.
-    away = np.abs(points - np.median(points[:: max(1, len(points) // 20_000)], axis=0)).max(1)
+    away = largest_of_rows(np.abs(points - np.median(points[:: max(1, len(points) // 20_000)], axis=0)))
     if len(points) > _SPACING_POINTS:
         away_limit = np.partition(away, _SPACING_POINTS)[_SPACING_POINTS]
         points = points[away <= away_limit]
@@ -203,17 +205,19 @@ def voxel_keys(points: FloatArray, voxel_size: float) -> IntArray:
     Raises:
         InputError: the cloud spans more than 2^21 voxels along an axis.
     """
-    cells = np.floor(points / voxel_size)
-    cells -= cells.min(0)
-    limit = 2**21
-    if cells.max() >= limit:
-        extent = float(np.ptp(points, axis=0).max())
-        raise InputError(
-            f"voxel size {voxel_size:.4g} is too small for a cloud of extent {extent:.4g}: more than "
-            f"{limit} voxels along one axis; use at least {extent / limit:.3g} or remove stray points"
-        )
-    index = cells.astype(np.int64)
-    keys: IntArray = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    limit = 2**_BITS
+    keys: IntArray = np.zeros(len(points), dtype=np.int64)
+    for column in points.T:
+        cells = np.floor(column / voxel_size)
+        cells -= cells.min()
+        if cells.max() >= limit:
+            extent = float(extents(points).max())
+            raise InputError(
+                f"voxel size {voxel_size:.4g} is too small for a cloud of extent {extent:.4g}: more than "
+                f"{limit} voxels along one axis; use at least {extent / limit:.3g} or remove stray points"
+            )
+        keys <<= _BITS
+        keys |= cells.astype(np.int64)
     return keys
 
 

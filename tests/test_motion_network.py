@@ -29,6 +29,7 @@ from geomoe3d.filters.inputs import MotionInputs, collate, pair_input
 from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
 from geomoe3d.filters.one_thread import single_torch_thread
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
+from geomoe3d.training import motions as motions_module
 from geomoe3d.training.batches import choose_motions, make_batch, make_sample
 from geomoe3d.training.config import TrainConfig, load_train_config
 from geomoe3d.training.losses import verdict_loss
@@ -449,6 +450,25 @@ def test_motions_are_proposed_once_and_the_run_goes_on(shards: Path, tmp_path: P
     assert (again.made, again.kept) == (1, 2)
     with pytest.raises(OutputError, match="seed"):
         propose_motions(shards, out, 50, seed=3)
+
+
+def test_pairs_without_a_motion_are_left_out(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = motions_module.propose, []
+
+    def sometimes(*arguments: Any, **named: Any) -> Any:
+        calls.append(1)
+        return real(*arguments, **named) if len(calls) % 4 else []
+
+    monkeypatch.setattr(motions_module, "propose", sometimes)
+    propose_motions(shards, tmp_path / "some", 100)
+    folder = ShardFolder(tmp_path / "some")
+    assert len(folder) == 75
+    assert all(len(folder[i].motions) > 0 for i in range(75))  # type: ignore[arg-type]
+    monkeypatch.setattr(motions_module, "propose", lambda *_, **__: [])
+    with pytest.raises(InputError, match=r"pairs 0 to 99 .* no motion for any"):
+        propose_motions(shards, tmp_path / "none", 100)
 
 
 def test_filter_without_any_motion_gives_no_weight() -> None:

@@ -63,7 +63,7 @@ def propose_motions(
     Args:
         features: folder of described fragments.
         out: folder of the shards; is made. Shards that are there are kept.
-        num_pairs: in all, rounded up to whole shards.
+        num_pairs: in all, rounded up to whole shards; those for which no motion is proposed are left out.
         seed: another seed draws other pairs and keypoints.
         workers: processes; the shards are the same for any number.
         progress: called with (shards done, shards in all).
@@ -127,7 +127,13 @@ class _Job:
 
 
 def _make(job: _Job) -> None:
-    write_shard(job.target, list(_pairs(_pool(job.features, job.seed), job.first)))
+    pairs = list(_pairs(_pool(job.features, job.seed), job.first))
+    if not pairs:
+        raise InputError(
+            f"pairs {job.first} to {job.first + PAIRS_PER_SHARD - 1} of '{job.features}': consensus proposes "
+            "no motion for any; their fragments hold too few points, describe them on a finer grid"
+        )
+    write_shard(job.target, pairs)
 
 
 @lru_cache(maxsize=1)
@@ -140,9 +146,11 @@ def _pairs(pool: FragmentPool, first: int) -> Iterator[TrainingPair]:
         try:
             drawn = pool[index]
             pair = as_training_pair(drawn)
-            yield with_motions(pair, pair.mutual if drawn.whole else None)
+            pair = with_motions(pair, pair.mutual if drawn.whole else None)
         except InputError as error:
             raise InputError(f"pair {index} of '{pool.folder}': {error}") from None
+        if pair.motions is not None and len(pair.motions):  # few and bad matches: nothing to judge
+            yield pair
 
 
 def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> TrainingPair:

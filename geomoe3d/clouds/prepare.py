@@ -193,9 +193,10 @@ def drop_duplicates(points: FloatArray) -> tuple[FloatArray, int]:
         column = bits[:, axis] * np.uint64(factor)
         mixed ^= column ^ (column >> np.uint64(29))
         mixed *= np.uint64(0xBF58476D1CE4E5B9)
-    _, first = np.unique(mixed, return_index=True)
-    if len(first) == len(points):
+    ordered = np.sort(mixed)  # half the time of an order; most clouds have no duplicates
+    if not (ordered[1:] == ordered[:-1]).any():
         return points, 0
+    _, first = np.unique(mixed, return_index=True)
     return points[np.sort(first)], len(points) - len(first)
 
 

@@ -1,9 +1,10 @@
 """Turn the weights of a training run into those that ship with the package, in half precision.
 
-    python scripts/ship_weights.py runs/motions [--last]
+    python scripts/ship_weights.py runs/motions [--last] [--out FILE]
 
 Reads best.pt, or the averaged weights of last.pt, of the run folder and its config.yaml, and writes
-geomoe3d/filters/weights/geomoe3d.safetensors and its card. Says how far the verdicts move by the rounding.
+geomoe3d/filters/weights/geomoe3d.safetensors and its card, or, to compare before shipping, FILE. Says how far
+the verdicts move by the rounding.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from geomoe3d.provenance import source_commit
 from geomoe3d.training.checkpoint import load_checkpoint
 from geomoe3d.training.config import load_train_config
 from geomoe3d.training.logs import read_csv
+from geomoe3d.training.pairs import ShardFolder
 
 NOTES = (
     "GeoMoE that judges motions; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
@@ -32,23 +34,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="run folder of geomoe3d train")
     parser.add_argument("--last", action="store_true", help="those of the last step, not of the best")
+    parser.add_argument(
+        "--out", type=Path, default=PACKAGED / f"{DEFAULT_WEIGHTS}.safetensors", help="file to write"
+    )
     given = parser.parse_args()
-    run = given.run
+    run, path = given.run, given.out
     state = load_checkpoint(run / ("last.pt" if given.last else "best.pt"))
-    model = GeoMoE(load_train_config(str(run / "config.yaml")).network)
+    config = load_train_config(str(run / "config.yaml"))
+    model = GeoMoE(config.network)
     averaged = state.get("averaged")
     model.load_state_dict(averaged["model"] if given.last and averaged else state["model"])
     card = WeightCard(
         architecture={},
-        voxel_size=(0.05, 0.05),
+        voxel_size=ShardFolder(config.data.train).voxel_sizes(),
         training_data=str(state.get("data", "")),
         steps=int(state["step"]),
         metrics=state.get("metrics", {}) if not given.last else last_metrics(run),
         commit=source_commit(),
         notes=NOTES,
     )
-    PACKAGED.mkdir(exist_ok=True)
-    path = PACKAGED / f"{DEFAULT_WEIGHTS}.safetensors"
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_pretrained(path, model, card, force=True, half=True)
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, step {card.steps}, {card.metrics}")
     print(f"verdicts move by up to {_moved(model.eval(), load_pretrained(path)[0]):.4f}")

@@ -218,15 +218,10 @@ class _Gather:
             field = field * weights_from_logits(logits)[:, None]
         q = product(self.query, z, self.query_bias).view(num, self.heads, -1, num_fields)
         into = torch.matmul(q.transpose(2, 3), self.key).view(num, self.heads * num_fields, -1)
-        rejected = logits <= 0 if logits is not None and self.prior == "mask" else None
-        if num == 1 and rejected is not None and not rejected.all():
-            # Alone, a pair need not visit what the prior rejects; several keep different numbers.
-            field = field.index_select(2, (~rejected[0]).nonzero()[:, 0])
-            rejected = None
         scores = torch.bmm(into, field)
-        if rejected is not None:
+        if logits is not None and self.prior == "mask":
             # Finite, so that attention is uniform where all are rejected.
-            scores.masked_fill_(rejected[:, None], _REJECTED)
+            scores.masked_fill_((logits <= 0)[:, None], _REJECTED)
         gathered = torch.bmm(scores.softmax(dim=2), field.transpose(1, 2))
         gathered = gathered.view(num, self.heads, num_fields, -1)
         return self.update(z, torch.matmul(self.value, gathered.transpose(2, 3)).view(z.shape))

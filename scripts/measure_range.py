@@ -160,10 +160,13 @@ def table_row(part: str, condition: str, rows: list[dict[str, Any]]) -> str:
 def ask(case: Case, settings: tuple[str, ...]) -> dict[str, Any]:
     """What came out for a case."""
     T: FloatArray | None
-    register = registrar((*settings, *case.settings)).register  # weights are read before the clock starts
-    parts_of(settings)
+    of_clouds = len(case.given) == 2
+    if of_clouds:  # weights are read before the clock starts
+        register = registrar((*settings, *case.settings)).register
+    else:
+        parts_of(settings)
     begin = time.perf_counter()
-    if len(case.given) == 2:
+    if of_clouds:
         result = register(*case.given)
         T, said = result.T_target_source, {"status": result.status, "confidence": result.confidence}
         said["voxel_size"] = result.voxel_size

@@ -15,7 +15,7 @@ import numpy as np
 from geomoe3d.data.rooms.arrange import MAKERS
 from geomoe3d.data.rooms.clutter import thing
 from geomoe3d.data.rooms.models import ModelLibrary
-from geomoe3d.data.rooms.solids import Solids
+from geomoe3d.data.rooms.solids import Solids, frame_along
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray
 
@@ -57,15 +57,15 @@ def looks_the_same_turned(solids: Solids) -> bool:
     from scipy.spatial.transform import Rotation
 
     low, high = solids.bounds
-    faces = np.concatenate(solids.faces)
-    mesh = trimesh.Trimesh(np.concatenate(solids.vertices) - (low + high) / 2, faces, process=False)
-    points = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0])
-    rays = o3d.t.geometry.RaycastingScene(nthreads=1)
-    tensor = o3d.core.Tensor.from_numpy
-    rays.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
+    center = (low + high) / 2
+    mesh = trimesh.Trimesh(np.concatenate(solids.vertices), np.concatenate(solids.faces), process=False)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0]) - center
+    rays = solids.scene()
     for axis, degrees in _TURNS:
-        turned = Rotation.from_euler("xyz"[axis], degrees, degrees=True).apply(points)
-        away = rays.compute_distance(tensor(turned.astype(np.float32)), nthreads=1).numpy()
+        turned = Rotation.from_euler("xyz"[axis], degrees, degrees=True).apply(points) + center
+        away = rays.compute_distance(
+            o3d.core.Tensor.from_numpy(turned.astype(np.float32)), nthreads=1
+        ).numpy()
         if np.mean(away < _SAME_PLACE * np.linalg.norm(high - low)) > _SAME_SHARE:
             return True
     return False
@@ -110,10 +110,7 @@ def _grown(rng: np.random.Generator) -> Solids:
         start = at + 0.7 * size * direction
         size = max(size * float(rng.uniform(0.4, 0.9)), 0.08)
         part, end = _limb(rng, size)
-        x = np.cross(direction, [1.0, 0, 0] if abs(direction[0]) < 0.9 else [0, 1.0, 0])
-        x /= np.linalg.norm(x)
-        R = np.column_stack([x, np.cross(direction, x), direction])
-        solids.place(part, make_transform(R, start))
+        solids.place(part, make_transform(frame_along(direction), start))
         joints.append((start + end * direction, size))
     return solids
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from geomoe3d.config import Section
 from geomoe3d.data.rooms.scenes import Scene
-from geomoe3d.data.rooms.walk import floor_below
+from geomoe3d.data.rooms.walk import floor_below, is_free
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray
 
@@ -97,7 +97,6 @@ def stand_scanner(rng: np.random.Generator, scene: Scene, count: int) -> list[Fl
     Each is 1 to 8 m from one before, 1.2 to 1.7 m above the floor, with nothing within 40 cm.
     Fewer than ``count`` where the scene has no more place.
     """
-    import open3d as o3d
     from scipy.spatial.transform import Rotation
 
     eyes: list[FloatArray] = []
@@ -113,8 +112,7 @@ def stand_scanner(rng: np.random.Generator, scene: Scene, count: int) -> list[Fl
         near = eyes[int(rng.integers(len(eyes)))] if eyes else None
         if near is not None and not _APART[0] < float(np.linalg.norm(eye - near)) < _APART[1]:
             continue
-        point = o3d.core.Tensor.from_numpy(eye[None].astype(np.float32))
-        if float(scene.rays.compute_distance(point, nthreads=1).numpy()[0]) > _CLEARANCE:
+        if is_free(scene, eye, _CLEARANCE):
             eyes.append(eye)
     turns = [[rng.uniform(0, 360), *rng.normal(0, _TILT_DEG, 2)] for _ in eyes]
     return [

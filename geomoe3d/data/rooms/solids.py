@@ -106,9 +106,7 @@ class Solids:
         if length == 0:
             return
         z = axis / length
-        x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
-        x /= np.linalg.norm(x)
-        R = np.column_stack([x, np.cross(z, x), z])
+        R = frame_along(z)
         middle = (np.asarray(start) + np.asarray(end)) / 2
         self.triangles((unit * (radius, radius, length)) @ R.T + middle, faces, color)
 
@@ -145,6 +143,13 @@ class Solids:
         scaled = vertices * (size[0] / (columns - 1), size[1] / (rows - 1), 0.0)
         scaled[:, 2] = heights.ravel()
         self.triangles(scaled + np.asarray(corner), faces, color)
+
+
+def frame_along(z: FloatArray) -> FloatArray:
+    """(3, 3) rotation that turns the vertical into the unit vector z (3,)."""
+    x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
 
 
 def grid_triangles(shape: tuple[int, ...]) -> tuple[FloatArray, IntArray]:

@@ -174,7 +174,7 @@ def _propose(
     if last is not None and not around:
         low, high = floor + np.array(settings.height)
         eye[2] = np.clip(last.eye[2] + rng.normal(0, 0.12), low, high)
-    if not _is_free(scene, eye, settings.clearance):
+    if not is_free(scene, eye, settings.clearance):
         return None
     return Stand(eye, yaw, pitch, float(rng.normal(0, 5)))
 
@@ -196,7 +196,8 @@ def floor_below(scene: Scene, x: float, y: float) -> float | None:
     return start - depth if np.isfinite(depth) and depth > 1.2 else None
 
 
-def _is_free(scene: Scene, eye: FloatArray, clearance: float) -> bool:
+def is_free(scene: Scene, eye: FloatArray, clearance: float) -> bool:
+    """Whether no surface is as near to a place (3,) as ``clearance``, metres."""
     import open3d as o3d
 
     point = o3d.core.Tensor.from_numpy(eye[None].astype(np.float32))

@@ -180,7 +180,7 @@ class Registrar:
             findings = chooser.conclude()
             if self._is_doubtful(findings.judgement):
                 for grid in config.second_look.grids:
-                    chooser.consider(self.propose_on_grid(grid * voxel_size, described, clock))
+                    chooser.consider(self.propose_on_grid(grid * voxel_size, described, clock, viewpoints))
                 findings = chooser.conclude(config.second_look.num_refined, config.second_look.num_judged)
         if voxel_size > wanted:
             findings = findings.with_note(
@@ -243,7 +243,11 @@ class Registrar:
         return matched, weighed, found
 
     def propose_on_grid(
-        self, voxel_size: float, described: tuple[PreparedCloud, PreparedCloud], clock: StageClock
+        self,
+        voxel_size: float,
+        described: tuple[PreparedCloud, PreparedCloud],
+        clock: StageClock,
+        viewpoints: tuple[FloatArray, FloatArray] | None = None,
     ) -> list[Hypothesis]:
         """Hypotheses from the same clouds on a coarser grid of this edge, where features see more.
 
@@ -256,7 +260,7 @@ class Registrar:
             target = self.describe_cloud(clouds[1], voxel_size, views[1], clock)
         except EmptyCloudError:
             return []
-        return self.propose((source, target), clock)[2]
+        return self.propose((source, target), clock, viewpoints)[2]
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, on coarser grids."""

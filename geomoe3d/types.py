@@ -94,6 +94,9 @@ class Correspondences:
         mutual: (N,) True where the source point is also the target's nearest in feature space, or None.
         viewpoints: (3,) places of the source's and the target's sensor, each in its own cloud's local
             coordinates, or None for both where they are not known.
+        normals: (N, 3) unit normals at the source and at the target points, each in its own cloud's local
+            coordinates, or None for both.
+        normals_signed: True where both clouds' normals are turned to the sensor, so that signs count.
     """
 
     points: FloatArray
@@ -103,6 +106,8 @@ class Correspondences:
     ratio: Float32Array | None = None
     mutual: BoolArray | None = None
     viewpoints: tuple[FloatArray, FloatArray] | None = None
+    normals: tuple[FloatArray, FloatArray] | None = None
+    normals_signed: bool = False
 
     def __len__(self) -> int:
         return len(self.points)
@@ -131,6 +136,8 @@ class Correspondences:
             pick(self.ratio),  # type: ignore[arg-type]
             pick(self.mutual),  # type: ignore[arg-type]
             self.viewpoints,
+            None if self.normals is None else (self.normals[0][rows], self.normals[1][rows]),
+            self.normals_signed,
         )
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
 from geomoe3d.estimators.consensus import ConsensusEstimator
+from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.evaluation.calibration import auroc_of
 from geomoe3d.evaluation.measures import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
@@ -41,14 +42,15 @@ def main() -> None:
         seen: dict[str, list[tuple[BoolArray, FloatArray]]] = {name: [] for name in judges}
         f1: dict[str, list[float]] = {name: [] for name in judges}
         for pair in list(iterate_fixed_correspondences(None, benchmark))[:: given.every]:
-            found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD)
+            given_rows = Correspondences(pair.points, viewpoints=AT_ZERO)
+            near = Surroundings.of(given_rows, INLIER_THRESHOLD)
+            found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, surroundings=near)
             if not found:
                 continue
             motions = np.array([h.T_target_source for h in found])
             truth = pair.T_target_source
             right = np.array([is_right(*motion_errors(T, truth)) for T in motions])
             labels = residuals(truth, pair.points[:, :3], pair.points[:, 3:]) < INLIER_THRESHOLD
-            given_rows = Correspondences(pair.points, viewpoints=AT_ZERO)
             for name, judge in judges.items():
                 judged = judge.about(given_rows, voxel_size=VOXEL_SIZE)(motions)
                 verdicts = np.array([j.verdict for j in judged])

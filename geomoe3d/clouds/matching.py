@@ -65,6 +65,8 @@ def match(
         distance.ravel(),
         None if ratio is None else ratio.ravel(),
         mutual,
+        normals=(source.normals[rows], target.normals[columns]),
+        normals_signed=source.viewpoint is not None and target.viewpoint is not None,
     ).take(keep)
     if len(found) <= config.max_correspondences:
         return found

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -225,6 +225,7 @@ def draw_pair(
         clouds.append(_cloud(points[rows], features[rows], voxel_size))
     matching = _MATCHING if kept is None else _MATCHING.model_copy(update={"max_correspondences": kept})
     found = match(clouds[0], clouds[1], matching, seed=0 if kept is None else int(rng.integers(1 << 31)))
+    found = replace(found, normals=None, normals_signed=False)  # shards hold none
     residual = np.linalg.norm(transform_points(T_target_source, found.source) - found.target, axis=1)
     labels: BoolArray = residual < inlier_threshold * voxel_size
     return DrawnPair(found, labels, T_target_source, voxel_size, kept is not None)
@@ -235,7 +236,7 @@ _MATCHING = MatchingConfig(method="one_way", neighbors=1, max_correspondences=1_
 
 
 def _cloud(points: Any, features: Any, voxel_size: float) -> PreparedCloud:
-    """Keypoints as `match` takes them; it looks at no normals."""
+    """Keypoints as `match` takes them; their normals are not known and not used."""
     places = points.astype(np.float64)
     unit = features.astype(np.float32)
     return PreparedCloud(places, np.zeros_like(places), unit, voxel_size, np.zeros(3), np.zeros(3))

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.estimators.base import check_correspondences
+from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.threads import each, single_blas_thread
@@ -45,8 +46,8 @@ class ConsensusEstimator:
         length_tolerance: difference of lengths that is compatible, in inlier thresholds.
         num_witnesses: correspondences among which common partners are counted, chosen as seeds are: the best
             supported, and a quarter spread over the others.
-        num_refined: distinct proposals that are refined, at least ``num_hypotheses``.
-        num_refits: rounds of reweighted refinement.
+        num_refined: distinct proposals that are refined before the choice, at least ``num_hypotheses``.
+        num_refits: rounds of reweighted refinement before the choice, and as many of the chosen after it.
         distinct_angle_deg, distinct_thresholds: two motions are the same when they differ by less than
             this angle and, at the centroid, by less than so many inlier thresholds.
         max_dense: largest N for which all pairs are formed; beyond it the heaviest are taken, ties by a
@@ -58,8 +59,8 @@ class ConsensusEstimator:
     set_sizes: tuple[int, ...] = (3, 6)
     length_tolerance: float = 0.8
     num_witnesses: int = 300
-    num_refined: int = 20
-    num_refits: int = 6
+    num_refined: int = 100
+    num_refits: int = 2
     distinct_angle_deg: float = 15.0
     distinct_thresholds: float = 3.0
     max_dense: int = 5000
@@ -72,9 +73,12 @@ class ConsensusEstimator:
         *,
         inlier_threshold: float,
         seed: int = 0,
+        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
         """See `Estimator`."""
         rows, given = check_correspondences(correspondences, weights, inlier_threshold)
+        if surroundings is not None:
+            surroundings = surroundings.take(given > 0)
         rows, given = rows[given > 0], given[given > 0]
         if len(rows) < 3:
             return []
@@ -84,12 +88,16 @@ class ConsensusEstimator:
         source, target = np.ascontiguousarray(unit[:, :3]), np.ascontiguousarray(unit[:, 3:])
         # Multiples of 1/1024 add up exactly in float32, in whatever order the threads do it.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
-        R, t, scores = self._propose(source, target, vote, self._dense_rows(given, seed))
-        keep = self._distinct_rows(R, t, scores, max(self.num_refined, self.num_hypotheses))
-        R, t = R[keep], t[keep]
-        for _ in range(self.num_refits):
-            R, t = refit(R, t, source, target, vote)
-        scores = score(R, t, source, target, vote)
+        R, t, scores = self._propose(source, target, vote, self._dense_rows(given, seed), surroundings)
+        for limit in (max(self.num_refined, self.num_hypotheses), self.num_hypotheses):
+            keep = self._distinct_rows(R, t, scores, limit)
+            R, t = R[keep], t[keep]
+            for _ in range(self.num_refits):
+                R, t = refit(R, t, source, target, vote)
+            scores = score(R, t, source, target, vote, surroundings)
+            if surroundings is not None:
+                factor = surroundings.plausibility(R, _shift(R, t, centre / inlier_threshold))
+                scores = scores * factor.astype(np.float32)
         best = self._distinct_rows(R, t, scores, self.num_hypotheses)
         return _finished(R[best], t[best], scores[best], rows, centre, vote, inlier_threshold)
 
@@ -102,11 +110,17 @@ class ConsensusEstimator:
         return np.sort(shuffled[heaviest])
 
     def _propose(
-        self, source: Float32Array, target: Float32Array, vote: Float32Array, rows: IntArray
+        self,
+        source: Float32Array,
+        target: Float32Array,
+        vote: Float32Array,
+        rows: IntArray,
+        surroundings: Surroundings | None,
     ) -> tuple[Floats, Floats, Float32Array]:
         """One motion per seed and size of its local set: R (K, 3, 3), t (K, 3), and their scores (K,)."""
         p, q, v = source[rows], target[rows], vote[rows]
-        source_distance, compatible = compatibility(p, q, self.length_tolerance)
+        near = None if surroundings is None else surroundings.take(rows)
+        source_distance, compatible = compatibility(p, q, self.length_tolerance, near)
         support = compatible @ v
         seeds = choose_seeds(support, source_distance, self.num_seeds)
         witnesses = np.sort(choose_seeds(support, source_distance, self.num_witnesses))
@@ -116,7 +130,7 @@ class ConsensusEstimator:
             sets = [(members[:, : size + 1], weights[:, : size + 1]) for size in self.set_sizes]
             fits = [fit_rigid(p[rows], q[rows], weight) for rows, weight in sets]
             R, t = (np.concatenate(part) for part in zip(*fits, strict=True))
-            return R, t, score(R, t, source, target, vote)
+            return R, t, score(R, t, source, target, vote, surroundings)
 
         R, t, scores = (np.concatenate(part) for part in zip(*each(of, _blocks(seeds)), strict=True))
         return R, t, scores
@@ -124,17 +138,19 @@ class ConsensusEstimator:
     def _distinct_rows(self, R: Floats, t: Floats, scores: Floats, limit: int) -> list[int]:
         """Greedy choice by score; each pick takes all motions close to it out of the race."""
         least_trace = 1 + 2 * np.cos(np.radians(self.distinct_angle_deg))
+        order = np.argsort(-scores, kind="stable")
+        turns, places = R[order].reshape(-1, 9), t[order]
+        left = np.ones(len(order), dtype=np.bool_)
         keep: list[int] = []
-        left = np.argsort(-scores, kind="stable")
-        while len(left) and len(keep) < limit:
-            pick = int(left[0])
-            keep.append(pick)
-            trace = np.einsum("kij,ij->k", R[left], R[pick])
+        pick = 0
+        while len(keep) < limit and left[pick:].any():
+            pick += int(left[pick:].argmax())
+            keep.append(int(order[pick]))
             # The centroid is at zero in these coordinates, so t is where it goes.
-            distance = np.linalg.norm(t[left] - t[pick], axis=1)
-            same = (trace > least_trace) & (distance < self.distinct_thresholds)
-            same[0] = True
-            left = left[~same]
+            away = places - places[pick]
+            near = np.einsum("ki,ki->k", away, away) < self.distinct_thresholds**2
+            left &= ~(near & (turns @ turns[pick] > least_trace))
+            left[pick] = False
         return keep
 
 
@@ -163,11 +179,17 @@ def _finished(
         return []
     R64, t64 = fit_rigid_shared(source, target, weights[firm])
     r2 = squared_residuals(R64, t64, source, target) / inlier_threshold**2
-    shift = t64 + centre[3:] - np.einsum("kij,j->ki", R64, centre[:3])
+    shift = _shift(R64, t64, centre)
     return [
         Hypothesis(make_transform(*motion), float(score_value), int(count))
         for *motion, score_value, count in zip(R64, shift, scores[firm], (r2 < 1).sum(1), strict=True)
     ]
+
+
+def _shift(R: Floats, t: Floats, centre: FloatArray) -> FloatArray:
+    """t (K, 3) of motions about ``centre`` (6,), the means of both halves, as they are about the origin."""
+    found: FloatArray = t + centre[3:] - np.einsum("kij,j->ki", R, centre[:3])
+    return found
 
 
 def bundle_weights(target: FloatArray) -> Float32Array:
@@ -189,10 +211,14 @@ def distances(a: Float32Array, b: Float32Array) -> Float32Array:
 
 
 def compatibility(
-    source: Float32Array, target: Float32Array, tolerance: float = 1.0
+    source: Float32Array,
+    target: Float32Array,
+    tolerance: float = 1.0,
+    surroundings: Surroundings | None = None,
 ) -> tuple[Float32Array, Float32Array]:
-    """Distances of the source points (N, N), and 1 where two correspondences preserve length, else 0.
+    """Distances of the source points (N, N), and how compatible two correspondences are, in [0, 1].
 
+    0 where they do not preserve length; else 1, or how well their planes agree where those are known.
     Points (N, 3) in inlier thresholds, as the tolerance; the diagonal of the second (N, N) is zero.
     """
     apart = np.empty((len(source), len(source)), dtype=np.float32)
@@ -204,6 +230,8 @@ def compatibility(
         gap = distances(target[block], target)
         gap -= apart[block]
         np.less(np.abs(gap, out=gap), tolerance, out=compatible[block], casting="unsafe")
+        if surroundings is not None:
+            compatible[block] *= surroundings.pairs(source, target, apart[block], block)
 
     each(fill, _blocks(np.arange(len(source))))
     np.fill_diagonal(compatible, 0)
@@ -258,10 +286,18 @@ def local_sets(
     return np.concatenate([seeds[:, None], members], 1), np.concatenate([seed_weight, weights], 1)
 
 
-def score(R: Floats, t: Floats, source: Float32Array, target: Float32Array, vote: Float32Array) -> Floats:
+def score(
+    R: Floats,
+    t: Floats,
+    source: Float32Array,
+    target: Float32Array,
+    vote: Float32Array,
+    surroundings: Surroundings | None = None,
+) -> Floats:
     """Sum of vote x exp(-r^2 / (2 0.75^2)) over all correspondences for each motion, (K,).
 
-    Residuals r in units of the inlier threshold. A smooth kernel, somewhat narrower than the threshold,
+    Residuals r in units of the inlier threshold; where normals are known each term is weighted by how well
+    they meet. A smooth kernel, somewhat narrower than the threshold,
     told right from wrong better than a count or a truncated square.
     """
     scores = np.empty(len(R), dtype=np.float32)
@@ -270,7 +306,10 @@ def score(R: Floats, t: Floats, source: Float32Array, target: Float32Array, vote
         part = slice(start, start + step)
         kernel = squared_residuals(R[part], t[part], source, target)
         kernel *= -0.5 / 0.75**2
-        scores[part] = np.einsum("kn,n->k", np.exp(kernel, out=kernel), vote)
+        np.exp(kernel, out=kernel)
+        if surroundings is not None:
+            kernel *= surroundings.matched(R[part])
+        scores[part] = np.einsum("kn,n->k", kernel, vote)
     return scores
 
 

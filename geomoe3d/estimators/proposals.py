@@ -10,8 +10,9 @@ import numpy as np
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator
+from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.filters.base import FilterOutput
-from geomoe3d.types import Correspondences, FloatArray, Hypothesis
+from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis
 
 
 def propose(
@@ -35,10 +36,21 @@ def propose(
     """
     if matched.mutual is not None:
         weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
-    found = estimate(matched.points, weights, inlier_threshold=inlier_threshold, seed=seed)
+    around = Surroundings.of(matched, inlier_threshold) if len(matched) else None
+
+    def of(rows: BoolArray) -> list[Hypothesis]:
+        near = None if around is None else around.take(rows)
+        return estimate(
+            matched.points[rows],
+            weights[rows],
+            inlier_threshold=inlier_threshold,
+            seed=seed,
+            surroundings=near,
+        )
+
+    found = of(np.ones(len(matched), dtype=np.bool_))
     if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
-        rows = matched.mutual
-        found += estimate(matched.points[rows], weights[rows], inlier_threshold=inlier_threshold, seed=seed)
+        found += of(matched.mutual)
     return found
 
 

@@ -13,14 +13,13 @@ Cost: about 10 ms, and 1 ms per motion, for 1,000 correspondences.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.clouds.keypoints import Surface
 from geomoe3d.estimators.consensus import bundle_weights, distances
 from geomoe3d.threads import each
 from geomoe3d.types import Float32Array, FloatArray, IntArray
@@ -46,52 +45,9 @@ CHANNELS = (
 """
 
 NUM_CHANNELS = len(CHANNELS)
-_NORMAL_NEIGHBORS = 10
-_PIXEL_DEG = 5.0  # keypoints are sparse: finer pixels would stay empty
 _MOST_ANCHORS = 1000
 _ROWS_AT_ONCE = 250
 _REACH = 3.0  # inlier thresholds in which a surface point of the other scan is sought
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Keypoints of one scan as a coarse surface, lengths in inlier thresholds.
-
-    Attributes:
-        points: (n, 3) distinct points.
-        normals: (n, 3) unit normals turned to the sensor, if it is known.
-        planarity: (n,) in [0, 1]; 1 on a plane.
-        tree: k-d tree of the points.
-        view: what the sensor saw, or None.
-        viewpoint: (3,) or None.
-    """
-
-    points: FloatArray
-    normals: FloatArray
-    planarity: FloatArray
-    tree: object
-    view: RangeImage | None
-    viewpoint: FloatArray | None
-
-    @classmethod
-    def of(cls, points: FloatArray, viewpoint: FloatArray | None) -> Surface:
-        """Normals by a plane through the nearest points."""
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        k = min(_NORMAL_NEIGHBORS, len(points))
-        _, near = tree.query(points, k=k)
-        patch = points[np.asarray(near).reshape(len(points), k)]
-        patch = patch - patch.mean(1, keepdims=True)
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", patch, patch))
-        normals = vectors[:, :, 0]
-        planarity = 1 - np.sqrt(np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-9))
-        view = None
-        if viewpoint is not None:
-            away = np.einsum("ij,ij->i", normals, viewpoint - points) < 0
-            normals = np.where(away[:, None], -normals, normals)
-            view = RangeImage.of(points, viewpoint, _PIXEL_DEG)
-        return cls(points, normals, planarity, tree, view, viewpoint)
 
 
 class AlignedChannels:

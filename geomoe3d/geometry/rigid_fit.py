@@ -89,6 +89,10 @@ def spread(points: Floats, weights: Floats) -> FloatArray:
     """
     w = np.asarray(weights, dtype=np.float64)
     w = w / np.maximum(w.sum(-1, keepdims=True), np.finfo(w.dtype).tiny)
-    centred = points - np.einsum("...n,nd->...d", w, points)[..., None, :]
-    covariance = np.einsum("...ni,...nj->...ij", centred * w[..., None], centred)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance.astype(np.float64))[..., 1], 0.0))
+    centred = np.asarray(points, dtype=np.float64)
+    centred = centred - centred.mean(0) if len(centred) else centred
+    products = (centred[:, :, None] * centred[:, None, :]).reshape(len(centred), 9)
+    moments = np.einsum("...n,nd->...d", w, np.hstack([centred, products]))
+    mean = moments[..., :3]
+    covariance = moments[..., 3:].reshape(*mean.shape, 3) - mean[..., :, None] * mean[..., None, :]
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., 1], 0.0))

@@ -162,9 +162,10 @@ def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> Trainin
         pair: with at least 3 correspondences.
         mutual: (N,) which matches are mutual, where others are to weigh less, as in registration.
     """
-    estimator = ConsensusEstimator(num_hypotheses=NUM_MOTIONS, num_refined=NUM_MOTIONS)
+    estimator = ConsensusEstimator(num_hypotheses=NUM_MOTIONS)
     threshold = _PROPOSING.inlier_threshold * pair.voxel_size
-    rows = Correspondences(pair.correspondences.astype(np.float64), mutual=mutual)
+    at_zero = (np.zeros(3), np.zeros(3))
+    rows = Correspondences(pair.correspondences.astype(np.float64), mutual=mutual, viewpoints=at_zero)
     found = propose(estimator, rows, np.ones(len(rows)), _PROPOSING, inlier_threshold=threshold, seed=0)
     motions = np.array([h.T_target_source for h in found]).reshape(-1, 4, 4)
     return replace(pair, motions=motions, viewpoints=np.zeros((2, 3)))

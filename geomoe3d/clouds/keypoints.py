@@ -1,0 +1,60 @@
+"""Keypoints of one scan taken as a coarse surface: planes, and what its sensor saw.
+
+Correspondences bring points, often nothing else. Those of one scan still trace its surfaces, at the spacing
+of the keypoints, and that is enough to ask in which plane a point lies and what must be empty. Place: used
+by estimation and by the network that judges motions; about 3 ms for 1,000 points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.types import FloatArray
+
+PIXEL_DEG = 5.0
+"""Pixels of what a sensor saw: keypoints are sparse, finer ones would stay empty."""
+_NORMAL_NEIGHBORS = 10
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Keypoints of one scan as a coarse surface, lengths in inlier thresholds.
+
+    Attributes:
+        points: (n, 3) distinct points.
+        normals: (n, 3) unit normals turned to the sensor, if it is known.
+        planarity: (n,) in [0, 1]; 1 on a plane.
+        tree: k-d tree of the points.
+        view: what the sensor saw, or None.
+        viewpoint: (3,) or None.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    planarity: FloatArray
+    tree: object
+    view: RangeImage | None
+    viewpoint: FloatArray | None
+
+    @classmethod
+    def of(cls, points: FloatArray, viewpoint: FloatArray | None) -> Surface:
+        """Normals by a plane through the nearest points."""
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        k = min(_NORMAL_NEIGHBORS, len(points))
+        _, near = tree.query(points, k=k)
+        patch = points[np.asarray(near).reshape(len(points), k)]
+        patch = patch - patch.mean(1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", patch, patch))
+        normals = vectors[:, :, 0]
+        planarity = 1 - np.sqrt(np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-9))
+        view = None
+        if viewpoint is not None:
+            away = np.einsum("ij,ij->i", normals, viewpoint - points) < 0
+            normals = np.where(away[:, None], -normals, normals)
+            view = RangeImage.of(points, viewpoint, PIXEL_DEG)
+        return cls(points, normals, planarity, tree, view, viewpoint)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.geometry.rigid_fit import fit_rigid, fit_rigid_shared, spread, squared_residuals
+from geomoe3d.geometry.rigid_fit import fit_rigid, fit_rigid_shared, spread, spread_shared, squared_residuals
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -212,3 +212,13 @@ def test_spread_is_the_second_standard_deviation() -> None:
     assert spread(np.ones((5, 3)), np.ones(5)) == 0
     assert spread(points, np.zeros(30)) == 0
     assert spread(np.zeros((0, 3)), np.zeros(0)) == 0
+
+
+def test_shared_spread_is_the_spread_of_each_weighting() -> None:
+    rng = np.random.default_rng(16)
+    points = rng.normal(size=(40, 3)) * [5, 3, 0.2]
+    weights = rng.random((6, 40)) * (rng.random((6, 40)) < 0.3)
+    weights[5] = 0
+    np.testing.assert_allclose(spread_shared(points, weights), spread(points, weights), rtol=1e-9)
+    line = np.outer(rng.normal(size=40), [1.0, 2, 3])
+    assert spread_shared(line, weights).max() < 1e-6

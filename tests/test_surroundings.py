@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.clouds.matching import match
 from geomoe3d.config import EstimatorConfig, MatchingConfig
+from geomoe3d.errors import InputError
 from geomoe3d.estimators.consensus import ConsensusEstimator, compatibility, score
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.estimators.surroundings import Surroundings
@@ -213,6 +214,27 @@ def test_matching_hands_on_the_normals() -> None:
     np.testing.assert_array_equal(found.normals[0], n[found.source_index])
     np.testing.assert_array_equal(found.normals[1], -n[order][found.target_index])
     assert not match(source, replace(target, viewpoint=None), MatchingConfig()).normals_signed
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda rows: rows.__setitem__((3, 2), np.nan), "correspondence 3 holds a NaN"),
+        (lambda rows: rows.__setitem__((4, 5), np.inf), "correspondence 4 holds a NaN"),
+    ],
+)
+def test_bad_rows_are_named_before_anything_is_fitted_to_them(spoil, message) -> None:
+    rows = np.random.default_rng(13).normal(size=(50, 6))
+    spoil(rows)
+    with pytest.raises(InputError, match=message):
+        propose(
+            ConsensusEstimator(),
+            Correspondences(rows),
+            np.ones(50),
+            EstimatorConfig(),
+            inlier_threshold=THRESHOLD,
+            seed=0,
+        )
 
 
 def test_proposing_hands_the_surroundings_to_the_estimator() -> None:

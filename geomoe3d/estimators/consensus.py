@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.estimators.base import check_correspondences
 from geomoe3d.estimators.surroundings import Surroundings
-from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread, squared_residuals
+from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread_shared, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, IntArray
@@ -173,7 +173,7 @@ def _finished(
     r2 = squared_residuals(R64, t64, source, target) / inlier_threshold**2
     weights = vote * (r2 < 1) / (1 + r2)
     # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
-    thinnest = np.minimum(spread(source, weights), spread(target, weights))
+    thinnest = np.minimum(spread_shared(source, weights), spread_shared(target, weights))
     firm = ((weights > 0).sum(1) >= 3) & (thinnest >= 0.05 * inlier_threshold)
     if not firm.any():
         return []

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.config import EstimatorConfig
-from geomoe3d.estimators.base import Estimator
+from geomoe3d.estimators.base import Estimator, check_correspondences
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.filters.base import FilterOutput
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis
@@ -33,7 +33,11 @@ def propose(
         config: weight of one-way matches, and whether there is a second round.
         inlier_threshold: cloud units.
         seed: decides every random choice.
+
+    Raises:
+        InputError: as `Estimator`.
     """
+    check_correspondences(matched.points, weights, inlier_threshold)
     if matched.mutual is not None:
         weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
     around = Surroundings.of(matched, inlier_threshold) if len(matched) else None

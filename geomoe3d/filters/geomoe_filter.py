@@ -114,7 +114,7 @@ class GeoMoEFilter:
     def look(self, correspondences: Correspondences, *, voxel_size: float) -> Insight:
         """Verdicts of all layers, sub-fields and experts, for drawing."""
         result = Insight.blind(len(correspondences), self.config.num_layers)
-        seen, part = finite_rows(correspondences)
+        seen, part = finite_part(correspondences)
         if len(seen) < MIN_CORRESPONDENCES:
             return result
         wanted = set(self.config.extra_channels)
@@ -126,7 +126,7 @@ class GeoMoEFilter:
         return result
 
 
-def finite_rows(correspondences: Correspondences) -> tuple[IntArray, Correspondences]:
+def finite_part(correspondences: Correspondences) -> tuple[IntArray, Correspondences]:
     """The rows without NaN or infinity, and the correspondences of these rows."""
     seen = np.flatnonzero(np.isfinite(correspondences.points).all(axis=1))
     return seen, correspondences if len(seen) == len(correspondences) else correspondences.take(seen)

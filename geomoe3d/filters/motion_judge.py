@@ -23,7 +23,7 @@ from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.base import FilterOutput
 from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.geomoe_filter import Insight, finite_rows, run_several
+from geomoe3d.filters.geomoe_filter import Insight, finite_part, run_several
 from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, MotionInputs
 from geomoe3d.filters.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
@@ -106,7 +106,7 @@ class MotionJudge:
             correspondences: N rows in local coordinates; free space is asked where ``viewpoints`` are given.
             voxel_size: the grid the points came from.
         """
-        seen, part = finite_rows(correspondences)
+        seen, part = finite_part(correspondences)
         inputs = None
         if len(seen) >= MIN_CORRESPONDENCES:
             inputs = MotionInputs(part.points, part.viewpoints or (None, None), voxel_size, self.config)
@@ -121,7 +121,7 @@ class MotionJudge:
             `MOST_MOTIONS`, in the order of their verdicts, then the others. Where no motion is proposed all
             weights are 0.
         """
-        seen, part = finite_rows(correspondences)
+        seen, part = finite_part(correspondences)
         blind = Insight.blind(len(correspondences), self.config.num_layers).output(self.config)
         if len(seen) < MIN_CORRESPONDENCES:
             return blind

@@ -75,8 +75,8 @@ class EstimatorConfig(Section):
 
     name: Literal["consensus", "ransac", "svd"] = Field(
         "consensus",
-        description="consensus: sets that preserve lengths; ransac: random samples; svd: one least squares "
-        "fit, for correspondences that are nearly all right",
+        description="consensus: sets that preserve lengths and planes; ransac: random samples; svd: one "
+        "least squares fit, for correspondences that are nearly all right",
     )
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
     num_hypotheses: int = Field(20, ge=1, description="distinct hypotheses that consensus keeps by round")

@@ -96,7 +96,7 @@ class Correspondences:
             coordinates, or None for both where they are not known.
         normals: (N, 3) unit normals at the source and at the target points, each in its own cloud's local
             coordinates, or None for both.
-        normals_signed: True where both clouds' normals are turned to the sensor, so that signs count.
+        normals_signed: True where both clouds' normals are turned to a known or guessed sensor: signs count.
     """
 
     points: FloatArray

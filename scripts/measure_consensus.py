@@ -52,9 +52,12 @@ def main() -> None:
         for pair in pairs:
             for name, estimate in methods.items():
                 begin = time.perf_counter()
-                rows = Correspondences(pair.points, viewpoints=AT_ZERO)
-                near = None if given.lengths_alone else Surroundings.of(rows, INLIER_THRESHOLD)
-                found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, surroundings=near)
+                if isinstance(estimate, ConsensusEstimator) and not given.lengths_alone:
+                    rows = Correspondences(pair.points, viewpoints=AT_ZERO)
+                    near = Surroundings.of(rows, INLIER_THRESHOLD)
+                    found = estimate.with_surroundings(near)(pair.points, inlier_threshold=INLIER_THRESHOLD)
+                else:
+                    found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD)
                 seconds[name].append(time.perf_counter() - begin)
                 right = [is_right(*motion_errors(h.T_target_source, pair.T_target_source)) for h in found]
                 best[name] += bool(right and right[0])

@@ -161,12 +161,13 @@ def test_distinct_motions_are_told_apart(pair):
 
 @pytest.fixture
 def grids_seen(monkeypatch):
-    """Edges of the grids on which hypotheses were sought."""
+    """Edges of the grids on which hypotheses were sought, all with the same places of the sensors."""
     seen: list[float] = []
     propose = Registrar.propose
 
     def spy(self, described, clock, viewpoints=None):
         seen.append(round(described[0].voxel_size / VOXEL, 6))
+        np.testing.assert_array_equal(viewpoints, np.zeros((2, 3)))
         return propose(self, described, clock, viewpoints)
 
     monkeypatch.setattr(Registrar, "propose", spy)

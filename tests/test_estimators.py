@@ -458,7 +458,13 @@ THREADS_SCRIPT = """
 import numpy as np
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
+from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
+from geomoe3d.types import Correspondences
+
+def asking(estimator, rows):
+    zero = np.zeros(3)
+    return estimator.with_surroundings(Surroundings.of(Correspondences(rows, viewpoints=(zero, zero)), 0.1))
 
 def show(name, estimator, rows, weights):
     for h in estimator(rows, weights, inlier_threshold=0.1, seed=5):
@@ -478,6 +484,7 @@ for seed, count in ((0, 300), (1, 1500), (2, 4000), (3, 40000)):
     target[wrong] = target[rng.integers(0, max(count // 2, 1), count)][wrong]
     rows = np.hstack([source, target])
     show("consensus", ConsensusEstimator(max_dense=2500, num_seeds=200), rows, weights)
+    show("asking", asking(ConsensusEstimator(max_dense=2500, num_seeds=200), rows), rows, weights)
     show("ransac", RansacEstimator(iterations=2000), rows[:4000], weights[:4000])
 """
 
@@ -497,7 +504,7 @@ def test_the_same_bytes_for_any_number_of_threads() -> None:
         )
         answers.append(done.stdout.splitlines())
     lines = {answer.split()[0] for answer in answers[0]}
-    assert lines == {"svd", "refits", "consensus", "ransac"}
+    assert lines == {"svd", "refits", "consensus", "asking", "ransac"}
     assert answers[1] == answers[2], "two runs with two threads differ"
     differing = {tuple(a.split()[:2]) for a, b in zip(*answers[:2], strict=True) if a != b}
     assert not differing, "one thread and two threads differ"

@@ -214,6 +214,14 @@ def test_spread_is_the_second_standard_deviation() -> None:
     assert spread(np.zeros((0, 3)), np.zeros(0)) == 0
 
 
+def test_spread_of_a_line_is_nothing_however_far_the_rows_of_weight_zero_lie() -> None:
+    rng = np.random.default_rng(17)
+    line = np.outer(rng.uniform(-1, 1, 10), [1.0, 2, 3]) + 1000
+    far = rng.normal(size=(200, 3)) * 1000
+    weights = np.r_[np.ones(10), np.zeros(200)]
+    assert spread(np.vstack([line, far]), weights) < 1e-6
+
+
 def test_shared_spread_is_the_spread_of_each_weighting() -> None:
     rng = np.random.default_rng(16)
     points = rng.normal(size=(40, 3)) * [5, 3, 0.2]

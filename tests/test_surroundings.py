@@ -9,12 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.clouds.matching import match
+from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import EstimatorConfig, MatchingConfig
 from geomoe3d.errors import InputError
 from geomoe3d.estimators.consensus import ConsensusEstimator, compatibility, score
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
+from geomoe3d.training import motions
+from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import Correspondences, PreparedCloud
 
 THRESHOLD = 0.1
@@ -201,6 +204,92 @@ def test_planes_find_inliers_that_lengths_alone_do_not() -> None:
     assert all(helped) and not all(alone)
 
 
+def two_motions(seed: int) -> tuple[Correspondences, Surroundings, np.ndarray, np.ndarray]:
+    """Rows for the true motion and somewhat more for one that walks a wall into the room, sensors apart.
+
+    Normals say nothing here; what the sensors saw is the whole room, not the rows' own points.
+    """
+    rng = np.random.default_rng(seed)
+    S, U = motion(seed + 1, 40.0), motion(seed + 2, 40.0)
+    D = make_transform(Rotation.from_euler("z", 30, degrees=True).as_matrix(), np.array([0.9, 0.3, 0.0]))
+    p, _ = room(rng, 420)
+    q = p.copy()
+    q[200:] = transform_points(D, q[200:])
+    rows = np.hstack([transform_points(S, p), transform_points(U, q)])
+    scan, _ = room(rng, 4000)
+    views = []
+    for frame, place in ((S, [1.5, -1.0, 0.4]), (U, [-1.2, 1.1, -0.3])):
+        seen = transform_points(frame, np.vstack([scan, [place]]))
+        views.append(RangeImage.of(seen[:-1] / THRESHOLD, seen[-1] / THRESHOLD, 5.0))
+    zero = np.zeros((420, 3), dtype=np.float32)
+    points = (rows[:, :3] / THRESHOLD, rows[:, 3:] / THRESHOLD)
+    around = Surroundings((zero, zero), True, points, (views[0], views[1]))
+    back = np.linalg.inv(S)
+    return Correspondences(rows), around, U @ back, U @ D @ back
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_free_space_decides_between_two_motions(seed: int) -> None:
+    given, around, right, wrong = two_motions(seed)
+    for near, expected in ((replace(around, views=None), wrong), (around, right)):
+        estimate = ConsensusEstimator().with_surroundings(near)
+        best = estimate(given.points, inlier_threshold=THRESHOLD)[0]
+        assert rotation_error_deg(best.T_target_source, expected) < 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_scan_is_asked_about_the_other(seed: int) -> None:
+    _, around, right, wrong = two_motions(seed)
+    true = transform_points(right, around.points[0] * THRESHOLD) / THRESHOLD
+    around = replace(around, points=(around.points[0], true))
+    assert around.views is not None
+    first, second = around.views
+    nothing = RangeImage.of(np.array([[1e6, 0.0, 0.0]]), np.zeros(3), 5.0)
+    R, t = np.stack([right, wrong])[:, :3, :3], np.stack([right, wrong])[:, :3, 3] / THRESHOLD
+    for views in ((first, nothing), (nothing, second)):
+        of_right, of_wrong = replace(around, views=views).plausibility(R, t)
+        assert of_right > 0.8 > 0.4 > of_wrong
+
+
+def test_rows_of_weight_zero_are_as_if_absent() -> None:
+    given, _ = rows_of(14, 300, 60)
+    around = Surroundings.of(given, THRESHOLD)
+    weights = (np.arange(300) % 3 > 0) * 1.0
+    estimate = ConsensusEstimator()
+    some = estimate.with_surroundings(around)(given.points, weights, inlier_threshold=THRESHOLD)
+    rows = weights > 0
+    alone = estimate.with_surroundings(around.take(rows))(given.points[rows], inlier_threshold=THRESHOLD)
+    assert len(some) > 0
+    for a, b in zip(some, alone, strict=True):
+        np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
+
+
+def test_more_rows_than_are_compared_keep_their_surroundings() -> None:
+    given, T = rows_of(15, 1000, 100)
+    weights = np.where(np.arange(1000) % 2 == 0, 1.0, 0.5)  # the heavy half takes part in proposing
+    estimate = ConsensusEstimator(max_dense=500, num_seeds=200)
+    asking = estimate.with_surroundings(Surroundings.of(given, THRESHOLD))
+    best = asking(given.points, weights, inlier_threshold=THRESHOLD)[0]
+    assert rotation_error_deg(best.T_target_source, T) < 1
+    assert best.num_inliers >= 100
+
+
+def test_a_normal_that_is_no_number_spoils_nothing_else() -> None:
+    given, T = rows_of(16, 300, 60)
+    assert given.normals is not None
+    given.normals[0][7] = np.nan
+    asking = ConsensusEstimator().with_surroundings(Surroundings.of(given, THRESHOLD))
+    assert rotation_error_deg(asking(given.points, inlier_threshold=THRESHOLD)[0].T_target_source, T) < 1
+
+
+def test_motions_for_training_are_proposed_with_the_sensors_at_zero(monkeypatch) -> None:
+    seen = []
+    monkeypatch.setattr(motions, "propose", lambda estimate, rows, *_, **__: seen.append(rows) or [])
+    points = np.random.default_rng(17).normal(size=(20, 6)).astype(np.float32)
+    motions.with_motions(TrainingPair(points, np.ones(20, dtype=bool), np.eye(4), 0.05))
+    np.testing.assert_array_equal(seen[0].viewpoints, np.zeros((2, 3)))
+
+
 def test_matching_hands_on_the_normals() -> None:
     rng = np.random.default_rng(11)
     features = np.abs(rng.normal(size=(50, 33))).astype(np.float32)
@@ -242,12 +331,16 @@ def test_proposing_hands_the_surroundings_to_the_estimator() -> None:
     given = replace(given, mutual=np.arange(100) < 40)
     seen = []
 
-    def estimate(correspondences, weights=None, *, inlier_threshold, seed=0, surroundings=None):
-        seen.append((np.asarray(correspondences), surroundings))
-        return []
+    class Asking:
+        def with_surroundings(self, around):
+            def estimate(correspondences, weights=None, *, inlier_threshold, seed=0):
+                seen.append((np.asarray(correspondences), around))
+                return []
+
+            return estimate
 
     config = EstimatorConfig(mutual_round=True)
-    propose(estimate, given, np.ones(100), config, inlier_threshold=THRESHOLD, seed=0)
+    propose(Asking(), given, np.ones(100), config, inlier_threshold=THRESHOLD, seed=0)
     assert [len(rows) for rows, _ in seen] == [100, 40]
     for rows, around in seen:
         np.testing.assert_allclose(around.points[0] * THRESHOLD, rows[:, :3], atol=1e-12)

@@ -1,8 +1,8 @@
 """What a sensor saw along each direction: the nearest surface, and so the space that must be free.
 
-Place: used by verification. A spherical image of about 2.5 degrees per pixel around the sensor; O(N) to
-build and to ask. Fused scans were seen from several places near the sensor, so the nearest surface in a
-3 x 3 neighbourhood counts, and a margin is left.
+Place: used by estimation and verification. A spherical image around the sensor, by default of 2.5 degrees per
+pixel; O(N) to build and to ask. Fused scans were seen from several places near the sensor, so the nearest
+surface in a 3 x 3 neighbourhood counts, and a margin is left.
 """
 
 from __future__ import annotations

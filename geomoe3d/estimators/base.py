@@ -9,12 +9,15 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import ConfigError, InputError
-from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.types import FloatArray, Hypothesis
 
 
 class Estimator(Protocol):
-    """Anything that turns weighted correspondences into hypotheses."""
+    """Anything that turns weighted correspondences into hypotheses.
+
+    One that can use normals at the points and what the sensors saw offers moreover ``with_surroundings``: it
+    takes `geomoe3d.estimators.surroundings.Surroundings` of the same rows and returns such an estimator.
+    """
 
     def __call__(
         self,
@@ -23,7 +26,6 @@ class Estimator(Protocol):
         *,
         inlier_threshold: float,
         seed: int = 0,
-        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
         """Estimate rigid motions p_target = R p_source + t.
 
@@ -33,7 +35,6 @@ class Estimator(Protocol):
             weights: (N,) non-negative, or None for all ones.
             inlier_threshold: largest residual of an inlier, same unit.
             seed: decides every random choice.
-            surroundings: normals at the points and what the sensors saw, for estimators that can use them.
 
         Returns:
             Distinct hypotheses, best first; empty where the correspondences do not determine a motion

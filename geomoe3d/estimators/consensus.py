@@ -1,28 +1,32 @@
-"""Consensus: motions proposed by sets of correspondences that agree about distances.
+"""Consensus: motions proposed by sets of correspondences that agree about distances and planes.
 
 A rigid motion preserves lengths, so two true correspondences i, j satisfy |p_i - p_j| = |q_i - q_j| up to
-noise. The steps, each one function below: *compatibility* of all pairs; *seeds*, the best supported
-correspondences spread over the scene; for each seed the *local sets* of correspondences that share most
-compatible partners with it (second-order compatibility, Chen et al., SC2-PCR, CVPR 2022); one weighted
-Kabsch per set; a *score* over all correspondences; reweighted *refinement* of the best distinct motions.
+noise; and how the planes at the points lie to each other, where those are known. The steps, each one function
+below: *compatibility* of all pairs; *seeds*, the best supported correspondences spread over the scene; for
+each seed the *local sets* of correspondences that share most compatible partners with it (second-order
+compatibility, Chen et al., SC2-PCR, CVPR 2022); one weighted Kabsch per set; a *score* over all
+correspondences; reweighted *refinement* of the best distinct motions.
 
 What differs from that paper: correspondences that share one target point vote with less weight (one-way
 matching sends many source points to one target, and such bundles agree with wrong motions by chance);
 the score is a smooth function of the residual; every seed is scored on all correspondences; several
-distinct hypotheses are kept for a later choice on the clouds.
+distinct hypotheses are kept for a later choice on the clouds; and what surrounds the correspondences is asked
+of pairs and of motions (`geomoe3d.estimators.surroundings`), without which lengths alone decide.
 
 Place: solve. Cost for N correspondences, M seeds and W witnesses: O(N^2) memory (4 bytes each, N at most
-``max_dense``), M N W multiply-adds; 1,000 take some 30 ms on one core, 20 on two.
+``max_dense``), M N W multiply-adds; 1,000 take some 50 ms on one core, 35 on two, a third of it for what
+surrounds them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.estimators.base import check_correspondences
+from geomoe3d.estimators.base import Estimator, check_correspondences
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread_shared, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
@@ -35,7 +39,7 @@ _SCORED_AT_ONCE = 500_000
 
 @dataclass(frozen=True)
 class ConsensusEstimator:
-    """Length-preserving consensus; deterministic for a given seed.
+    """Consensus about lengths and planes; deterministic for a given seed.
 
     Attributes:
         num_hypotheses: distinct motions returned at most.
@@ -65,6 +69,10 @@ class ConsensusEstimator:
     distinct_thresholds: float = 3.0
     max_dense: int = 5000
 
+    def with_surroundings(self, surroundings: Surroundings) -> Estimator:
+        """The same, asking what surrounds the correspondences that it will be given, in their order."""
+        return partial(self, surroundings=surroundings)
+
     @single_blas_thread()
     def __call__(
         self,
@@ -86,10 +94,14 @@ class ConsensusEstimator:
         # One unit of length is the inlier threshold from here on, so float32 keeps enough digits.
         unit = ((rows - centre) / inlier_threshold).astype(np.float32)
         source, target = np.ascontiguousarray(unit[:, :3]), np.ascontiguousarray(unit[:, 3:])
-        # Multiples of 1/1024 add up exactly in float32, in whatever order the threads do it.
+        # Multiples of 1/1024 add up exactly in float32, in whatever order. Weighed by planes they do not:
+        # fixed blocks and one BLAS thread keep the answers the same for any number of threads.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
         R, t, scores = self._propose(source, target, vote, self._dense_rows(given, seed), surroundings)
-        for limit in (max(self.num_refined, self.num_hypotheses), self.num_hypotheses):
+        some = (
+            self.num_hypotheses + self.num_hypotheses // 2
+        )  # refits bring some together, and some are not firm
+        for limit in (max(self.num_refined, some), some):
             keep = self._distinct_rows(R, t, scores, limit)
             R, t = R[keep], t[keep]
             for _ in range(self.num_refits):
@@ -98,8 +110,9 @@ class ConsensusEstimator:
             if surroundings is not None:
                 factor = surroundings.plausibility(R, _shift(R, t, centre / inlier_threshold))
                 scores = scores * factor.astype(np.float32)
-        best = self._distinct_rows(R, t, scores, self.num_hypotheses)
-        return _finished(R[best], t[best], scores[best], rows, centre, vote, inlier_threshold)
+        best = self._distinct_rows(R, t, scores, some)
+        finished = _finished(R[best], t[best], scores[best], rows, centre, vote, inlier_threshold)
+        return finished[: self.num_hypotheses]
 
     def _dense_rows(self, given: FloatArray, seed: int) -> IntArray:
         """Rows that take part in proposing, at most ``max_dense``: the heaviest, ties by seeded choice."""
@@ -296,9 +309,9 @@ def score(
 ) -> Floats:
     """Sum of vote x exp(-r^2 / (2 0.75^2)) over all correspondences for each motion, (K,).
 
-    Residuals r in units of the inlier threshold; where normals are known each term is weighted by how well
-    they meet. A smooth kernel, somewhat narrower than the threshold,
-    told right from wrong better than a count or a truncated square.
+    Residuals r in units of the inlier threshold; with surroundings each term is weighed by how well the
+    normals meet. A smooth kernel, somewhat narrower than the threshold, told right from wrong better than a
+    count or a truncated square.
     """
     scores = np.empty(len(R), dtype=np.float32)
     step = max(1, _SCORED_AT_ONCE // max(len(source), 1))

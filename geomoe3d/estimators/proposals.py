@@ -40,17 +40,15 @@ def propose(
     check_correspondences(matched.points, weights, inlier_threshold)
     if matched.mutual is not None:
         weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
-    around = Surroundings.of(matched, inlier_threshold) if len(matched) else None
+    asking = getattr(estimate, "with_surroundings", None) if len(matched) else None
+    around = None if asking is None else Surroundings.of(matched, inlier_threshold)
 
     def of(rows: BoolArray) -> list[Hypothesis]:
-        near = None if around is None else around.take(rows)
-        return estimate(
-            matched.points[rows],
-            weights[rows],
-            inlier_threshold=inlier_threshold,
-            seed=seed,
-            surroundings=near,
+        one = estimate if asking is None or around is None else asking(around.take(rows))
+        found: list[Hypothesis] = one(
+            matched.points[rows], weights[rows], inlier_threshold=inlier_threshold, seed=seed
         )
+        return found
 
     found = of(np.ones(len(matched), dtype=np.bool_))
     if config.mutual_round and matched.mutual is not None and not matched.mutual.all():

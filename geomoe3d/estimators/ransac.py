@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.estimators.base import check_correspondences
-from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray, Hypothesis
@@ -37,10 +36,8 @@ class RansacEstimator:
         *,
         inlier_threshold: float,
         seed: int = 0,
-        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
-        """See `Estimator`. Weights only select: correspondences of weight zero are left out;
-        ``surroundings`` are not used.
+        """See `Estimator`. Weights only select: correspondences of weight zero are left out.
 
         Open3D answers a search without any inlier with the identity; that is no answer and gives [].
         """

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.estimators.base import check_correspondences
-from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import Hypothesis
@@ -34,10 +33,8 @@ class WeightedSvdEstimator:
         *,
         inlier_threshold: float,
         seed: int = 0,
-        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
-        """See `Estimator`. Returns one hypothesis or none; ``seed`` and
-        ``surroundings`` are not used."""
+        """See `Estimator`. Returns one hypothesis or none; ``seed`` is not used."""
         rows, w = check_correspondences(correspondences, weights, inlier_threshold)
         source, target = rows[:, :3], rows[:, 3:]
         if (w > 0).sum() < 3 or min(spread(source, w), spread(target, w)) < 1e-6 * inlier_threshold:

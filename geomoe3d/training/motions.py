@@ -28,6 +28,8 @@ from geomoe3d.types import BoolArray, Correspondences
 from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 NUM_MOTIONS = 24
+PROPOSER_VERSION = 2
+"""Raise it with every change of what consensus proposes: motions of two kinds must not share a folder."""
 PAIRS_PER_SHARD = 100
 SETTINGS = DrawSettings(
     usual_share=0.7, keypoints=(250, 2000), band_shares=(0.5, 0.3, 0.2), min_inliers=0, whole_share=0.4
@@ -78,7 +80,10 @@ def propose_motions(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder '{out}': {error.strerror}") from None
-    _check_identity(out / _IDENTITY, {"seed": seed, "motions": NUM_MOTIONS, "pool": pool_identity})
+    _check_identity(
+        out / _IDENTITY,
+        {"seed": seed, "motions": NUM_MOTIONS, "proposer": PROPOSER_VERSION, "pool": pool_identity},
+    )
     jobs = [
         _Job(Path(features), out / f"motions-{seed:02d}-{k:05d}", seed, k * PAIRS_PER_SHARD)
         for k in range(-(-num_pairs // PAIRS_PER_SHARD))

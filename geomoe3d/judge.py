@@ -20,10 +20,10 @@ from geomoe3d.verification import MOST_VERDICT, Evidence
 # Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
 # one, mixed by overlap as the benchmarks are, and on unrelated pairs: 300 and 150 pairs, each with one look
 # and with two; docs/measurements.md holds what came of it on real scans.
-_OFFSET = 8.692
-_SLOPES = np.array([1.167, 2.543, -0.907, 0.834, -104.553, 1.335])
-_OFFSET_WITH_VERDICT = 2.763
-_SLOPES_WITH_VERDICT = np.array([1.562, 0.548, -1.304, 0.668, -57.633, 0.538])
+_OFFSET = 8.763
+_SLOPES = np.array([1.245, 0.847, -1.49, 0.941, -76.562, 1.253])
+_OFFSET_WITH_VERDICT = 1.323
+_SLOPES_WITH_VERDICT = np.array([1.315, 0.543, -2.034, 0.642, -45.163, 0.638])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002, 0.01, 1e-3
 _MOST_LEAD = 30.0
 _MOST_VIOLATION = 0.1

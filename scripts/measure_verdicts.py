@@ -44,7 +44,7 @@ def main() -> None:
         for pair in list(iterate_fixed_correspondences(None, benchmark))[:: given.every]:
             given_rows = Correspondences(pair.points, viewpoints=AT_ZERO)
             near = Surroundings.of(given_rows, INLIER_THRESHOLD)
-            found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, surroundings=near)
+            found = estimate.with_surroundings(near)(pair.points, inlier_threshold=INLIER_THRESHOLD)
             if not found:
                 continue
             motions = np.array([h.T_target_source for h in found])

@@ -98,9 +98,8 @@ class ConsensusEstimator:
         # fixed blocks and one BLAS thread keep the answers the same for any number of threads.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
         R, t, scores = self._propose(source, target, vote, self._dense_rows(given, seed), surroundings)
-        some = (
-            self.num_hypotheses + self.num_hypotheses // 2
-        )  # refits bring some together, and some are not firm
+        # Refits bring some together, and some are not firm: half as many again are carried to the end.
+        some = self.num_hypotheses + self.num_hypotheses // 2
         for limit in (max(self.num_refined, some), some):
             keep = self._distinct_rows(R, t, scores, limit)
             R, t = R[keep], t[keep]

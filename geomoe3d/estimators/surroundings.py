@@ -27,9 +27,7 @@ _TURN_SIGMA = 0.35  # of the cosine between two planes, both scans' difference
 _LEAST_AGREEMENT = 0.1  # a pair's normals may both be badly fitted
 _MATCHED_FLOOR, _MATCHED_SLOPE, _MATCHED_LEAST = 0.3, 0.7, 0.05  # weight of a cosine: 1 at 1, 0.3 at 0
 _ASKED = 350  # at most so many points of each scan are sought in the other's free space
-_NEAR = (
-    30.0  # thresholds from the sensor up to which depths are taken as they are: pixels widen with the range
-)
+_NEAR = 30.0  # thresholds from the sensor beyond which depths are shortened: pixels widen with the range
 _DEEPEST = 8.0  # thresholds in front of what was seen from where on a point counts fully
 _VIOLATION_WEIGHT = 32.0  # chosen among 8 to 64 on generated pairs, which rank on with it, and on real ones
 _LEAST_PLAUSIBILITY = 0.02  # a place that is wrongly taken for the sensor's must not decide everything

@@ -162,20 +162,27 @@ class Surroundings:
         source_view, target_view = self.views
         step = max(1, -(-len(self.points[0]) // _ASKED))
         p, q = (points[::step] for points in self.points)
-        moved = np.einsum("kij,nj->kni", R, p) + t[:, None]
-        back = np.einsum("kji,knj->kni", R, q[None] - t[:, None])
+        # R p + t of all motions as one product: einsum takes six times as long.
+        moved = _turned(p, R) + t
+        back = _turned(q, R.transpose(0, 2, 1)) - np.einsum("kji,kj->ki", R, t)
         asked = [(target_view, moved), (source_view, back)]
         one, other = each(lambda pair: _depth_in_front(*pair), asked)
         factors: FloatArray = np.maximum(np.exp(-_VIOLATION_WEIGHT * (one + other)), _LEAST_PLAUSIBILITY)
         return factors
 
 
+def _turned(points: FloatArray, R: NDArray[Any]) -> FloatArray:
+    """(n, K, 3) points (n, 3) under rotations (K, 3, 3)."""
+    found: FloatArray = (points @ R.reshape(-1, 3).T).reshape(len(points), len(R), 3)
+    return found
+
+
 def _depth_in_front(view: RangeImage, points: FloatArray) -> FloatArray:
-    """Mean over n points of (K, n, 3), for each K, of how far beyond the threshold they lie in front."""
+    """Mean over n points of (n, K, 3), for each K, of how far beyond the threshold they lie in front."""
     flat = points.reshape(-1, 3)
     seen, margin = view.margins(flat)
     away = flat - view.viewpoint
     scale = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)) / _NEAR, 1.0)
     depth = np.where(seen, np.clip(-margin / scale - 1, 0, _DEEPEST) / _DEEPEST, 0.0)
-    means: FloatArray = depth.reshape(points.shape[:2]).mean(1)
+    means: FloatArray = depth.reshape(points.shape[:2]).mean(0)
     return means

@@ -157,6 +157,7 @@ def _evidence(evidence: Evidence, information: Information) -> dict[str, float]:
         "surface_score": evidence.surface_score,
         "score": evidence.score,
         "observability": information.observability,
+        "looseness": information.looseness,
     }
 
 

@@ -27,7 +27,7 @@ class Section(BaseModel):
 class PreparationConfig(Section):
     """From a raw cloud to voxel points with oriented normals."""
 
-    voxel_points: int = Field(5000, ge=200, description="points per cloud that an automatic voxel aims at")
+    voxel_points: int = Field(3500, ge=200, description="points per cloud that an automatic voxel aims at")
     max_points: int = Field(
         30_000, ge=100, description="most voxel points per cloud; a finer voxel size is raised and said"
     )

@@ -2,7 +2,7 @@
 
 Place: judge, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
 the clouds, its lead over the best clearly different motion, the overlap, how firmly the shared surface holds
-the source, and the verdict of the network, or the share of correspondences that agree where there is none.
+the source and its sensor, and the share of correspondences that agree.
 """
 
 from __future__ import annotations
@@ -12,19 +12,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.config import JudgementConfig
-from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.geometry.se3 import cross_matrix, transform_points
 from geomoe3d.result import Status
 from geomoe3d.types import FloatArray, PreparedCloud
-from geomoe3d.verification import MOST_VERDICT, Evidence
+from geomoe3d.verification import Evidence
 
 # Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
 # one, mixed by overlap as the benchmarks are, and on unrelated pairs: 300 and 150 pairs, each with one look
 # and with two; docs/measurements.md holds what came of it on real scans.
-_OFFSET = 8.763
-_SLOPES = np.array([1.245, 0.847, -1.49, 0.941, -76.562, 1.253])
-_OFFSET_WITH_VERDICT = 1.323
-_SLOPES_WITH_VERDICT = np.array([1.315, 0.543, -2.034, 0.642, -45.163, 0.638])
+_OFFSET = -1.216
+_SLOPES = np.array([0.888, 2.244, -3.972, 0.435, -3.014, 1.249, -74.871])
+_OFFSET_WITH_VERDICT = -1.887
+_SLOPES_WITH_VERDICT = np.array([1.187, 1.083, -3.13, 0.756, -2.423, 0.488, -71.387])
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002, 0.01, 1e-3
+_LEAST_LOOSENESS, _MOST_LOOSENESS = 0.02, 10.0
+_LOOSEST = 1000.0
 _MOST_LEAD = 30.0
 _MOST_VIOLATION = 0.1
 UNRIVALLED_LEAD = 3.0
@@ -54,12 +56,17 @@ class Information:
         observability: smallest eigenvalue of the same sum per point with lengths divided by the root mean
             square radius; 1/3 would be held equally from all sides, 0 means that the source can slide.
         num_matched: matched points.
+        looseness: standard deviation of where the motion puts the source's sensor, or its centroid where no
+            place is known or guessed, in voxels, if the gaps between the surfaces were independent from point
+            to point. They are not, so it tells a loose fit from a firm one and is no error bar. At most 1000,
+            which is also what stands for fewer than 6 points.
     """
 
     matrix: FloatArray
     center: FloatArray
     observability: float
     num_matched: int
+    looseness: float = _LOOSEST
 
 
 def measure_information(
@@ -67,7 +74,7 @@ def measure_information(
 ) -> Information:
     """Point-to-plane information of a motion over source points within ``threshold`` of the target.
 
-    Returns NaN matrices and observability 0 for fewer than 6 matched points.
+    Returns NaN matrices, observability 0 and looseness 1000 for fewer than 6 matched points.
     """
     from scipy.spatial import cKDTree
 
@@ -86,7 +93,19 @@ def measure_information(
     radius = float(np.sqrt(np.mean(np.sum((points - center) ** 2, axis=1))))
     scaled = J / np.array([radius] * 3 + [1.0] * 3)
     smallest = float(np.linalg.eigvalsh(scaled.T @ scaled / len(points))[0])
-    return Information(J.T @ J / variance, center, max(smallest, 0.0), int(hit.sum()))
+    matrix = J.T @ J / variance
+    place = source.points.mean(0) if source.viewpoint is None else source.viewpoint
+    sensor = transform_points(T_target_source, place[None])[0]
+    looseness = deviation_at(matrix, center, sensor) / source.voxel_size
+    return Information(matrix, center, max(smallest, 0.0), int(hit.sum()), min(looseness, _LOOSEST))
+
+
+def deviation_at(matrix: FloatArray, center: FloatArray, point: FloatArray) -> float:
+    """Standard deviation of where a motion puts a point (3,), by its information (6, 6) about ``center``."""
+    J = np.hstack([-cross_matrix(point - center), np.eye(3)])  # p + w x (p - c) + v
+    # Never singular: what nothing holds may be anywhere.
+    covariance = np.linalg.inv(matrix + 1e-12 * np.trace(matrix) * np.eye(6))
+    return float(np.sqrt(max(np.trace(J @ covariance @ J.T), 0.0)))
 
 
 def judge(
@@ -111,7 +130,7 @@ def judge(
         ``ambiguous`` where the surfaces let the source slide, or where the answer would be likely but another
         motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
-    confidence = confidence_score(evidence, lead, support, information.observability)
+    confidence = confidence_score(evidence, lead, support, information)
     notes = []
     if evidence.overlap < _LOW_OVERLAP:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -128,7 +147,7 @@ def judge(
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
-    alone = confidence_score(evidence.by_clouds(), UNRIVALLED_LEAD, support, information.observability)
+    alone = confidence_score(evidence.by_clouds(), UNRIVALLED_LEAD, support, information)
     close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(evidence, rival, config.ambiguity_ratio)
     if close and alone >= _LIKELY:
         notes.append(
@@ -171,43 +190,45 @@ CONFIDENCE_INPUTS = (
     "log lead",
     "log overlap",
     "log observability",
-    "free-space violation",
+    "log looseness",
     "log support",
+    "free-space violation",
 )
-"""What the confidence is made of without a network, in the order of `confidence_inputs`.
-
-With one, its verdict stands in the place of the support, which the network sees itself."""
+"""What the confidence is made of, in the order of `confidence_inputs`."""
 
 
-def confidence_inputs(evidence: Evidence, lead: float, support: float, observability: float) -> FloatArray:
-    """(6,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
+def confidence_inputs(
+    evidence: Evidence, lead: float, support: float, information: Information
+) -> FloatArray:
+    """(7,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
 
     More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. A surface that
-    hardly holds the source is one: the answer may have slid off along it. The violation enters as it is,
-    bounded, beside its part in the evidence, which choosing needs but which is not all that it says of the
-    answer. The last entry is the verdict of the network, bounded, where there is one, and the logarithm of
-    the support where not.
+    hardly holds the source is one: the answer may have slid off along it; and one that leaves the sensor
+    loose, far off at the end of a lever, is the worst. The violation enters as it is, bounded, beside its
+    part in the evidence, which choosing needs but which is not all that it says of the answer. The verdict of
+    a network enters through the lead alone: by itself it is surer on scans like those it was trained on.
     """
-    shared = np.log(
-        [
-            max(evidence.surface_score, _LEAST_SCORE),
-            min(max(lead, 0.5), _MOST_LEAD),
-            evidence.overlap + _LEAST_OVERLAP,
-            observability + _ADDED_OBSERVABILITY,
-        ]
+    return np.append(
+        np.log(
+            [
+                max(evidence.surface_score, _LEAST_SCORE),
+                min(max(lead, 0.5), _MOST_LEAD),
+                evidence.overlap + _LEAST_OVERLAP,
+                information.observability + _ADDED_OBSERVABILITY,
+                min(max(information.looseness, _LEAST_LOOSENESS), _MOST_LOOSENESS),
+                support + _LEAST_SUPPORT,
+            ]
+        ),
+        min(evidence.free_space_violation, _MOST_VIOLATION),
     )
-    shared = np.append(shared, min(evidence.free_space_violation, _MOST_VIOLATION))
-    if evidence.verdict is None:
-        return np.append(shared, np.log(support + _LEAST_SUPPORT))
-    return np.append(shared, np.clip(evidence.verdict, -MOST_VERDICT, MOST_VERDICT))
 
 
-def confidence_score(evidence: Evidence, lead: float, support: float, observability: float) -> float:
+def confidence_score(evidence: Evidence, lead: float, support: float, information: Information) -> float:
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
     if evidence.score <= 0:
         return 0.0
     offset, slopes = _OFFSET, _SLOPES
     if evidence.verdict is not None:
         offset, slopes = _OFFSET_WITH_VERDICT, _SLOPES_WITH_VERDICT
-    strength = offset + confidence_inputs(evidence, lead, support, observability) @ slopes
+    strength = offset + confidence_inputs(evidence, lead, support, information) @ slopes
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

@@ -71,7 +71,8 @@ class RegistrationResult:
         overlap: share of source voxel points (1,500 of them at most) with a target point within the inlier
             threshold.
         evidence: what the clouds say of the answer, see `geomoe3d.verification.Evidence`, and
-            ``observability``, see `geomoe3d.judge.Information`; empty where nothing was estimated.
+            ``observability`` and ``looseness``, see `geomoe3d.judge.Information`; empty where nothing was
+            estimated.
         num_correspondences: correspondences given to the estimator.
         num_inliers: of these, how many agree with the transform.
         inlier_threshold: residual limit of an inlier, cloud units.

@@ -27,7 +27,7 @@ _AT_ONCE = 5  # hypotheses asked about together, for any number of threads
 _LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
 _VIOLATION_WEIGHT = 10.0  # a tenth of the visible points in free space divides the score by e
 _VERDICT_WEIGHT = 0.5
-MOST_VERDICT = 8.0
+_MOST_VERDICT = 8.0
 _VISIBLE_FLOOR = 0.05  # fewer visible points than this share make the violation rate unreliable
 
 
@@ -67,7 +67,7 @@ class Evidence:
         """See the class; the quantity by which hypotheses are chosen."""
         if self.verdict is None:
             return self.surface_score
-        verdict = min(max(self.verdict, -MOST_VERDICT), MOST_VERDICT)
+        verdict = min(max(self.verdict, -_MOST_VERDICT), _MOST_VERDICT)
         return self.surface_score * float(np.exp(_VERDICT_WEIGHT * verdict))
 
 
@@ -133,7 +133,9 @@ class Verifier:
         R, t = motions[:, :3, :3], motions[:, None, :3, 3]
         K, n = len(motions), len(self._points)
         moved = self._points @ R.transpose(0, 2, 1) + t
-        distance, nearest = self._tree.query(moved.reshape(-1, 3), distance_upper_bound=self._threshold)
+        distance, nearest = map(
+            np.asarray, self._tree.query(moved.reshape(-1, 3), distance_upper_bound=self._threshold)
+        )
         hit = np.flatnonzero(np.isfinite(distance))
         distance, nearest = distance[hit], nearest[hit]
         motion, asked = np.divmod(hit, n)
@@ -153,7 +155,7 @@ class Verifier:
         return [Evidence(*row) for row in np.stack(columns, axis=1).tolist()]
 
     def _chance(self, asked: IntArray, nearest: IntArray) -> FloatArray:
-        """How likely a random target point looks as similar to each asked point as its ``nearest``: p-values."""
+        """p-values: how likely a random target point is as similar to an asked point as its ``nearest``."""
         features = self._target_features[nearest].astype(np.float64)
         similarity = np.einsum("ij,ij->i", self._features[asked], features).astype(np.float32)
         place = np.searchsorted(self._random_similarity, similarity + self._lift[asked], side="right")
@@ -167,7 +169,9 @@ class Verifier:
             return total
         back = (self._back - t) @ R
         for view, points in ((self._target_view, moved), (self._source_view, back)):
-            seen, margins = (values.reshape(points.shape[:2]) for values in view.margins(points.reshape(-1, 3)))
+            seen, margins = (
+                values.reshape(points.shape[:2]) for values in view.margins(points.reshape(-1, 3))
+            )
             through = (margins < -2 * self._threshold).sum(1)
             total += through / (seen.sum(1) + _VISIBLE_FLOOR * points.shape[1])
         return total

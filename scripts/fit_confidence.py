@@ -26,14 +26,14 @@ from geomoe3d.config import load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.evaluation.measures import is_right, motion_errors
-from geomoe3d.judge import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, confidence_inputs
+from geomoe3d.judge import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, Information, confidence_inputs
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
 from geomoe3d.verification import Evidence
 
 BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 """Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""
-UNRELATED_WEIGHT = 0.5
+UNRELATED_WEIGHT = 0.25
 LOOKS = (["second_look.grids=[]"], ["second_look.below=1.0", "judgement.min_confidence=1.0"])
 """Settings by which a pair gets one look, and always two."""
 
@@ -70,7 +70,7 @@ def measure(
     known = {
         (r["source"], r["target"], r["look"]): r
         for r in map(json.loads, lines)
-        if r["assignments"] == assignments and "observability" in r  # not of an earlier version
+        if r["assignments"] == assignments and "looseness" in r  # not of an earlier version
     }
     registrars = [Registrar(load_config(None, [*assignments, *look])) for look in LOOKS]
     with out.open("a") as file:
@@ -94,6 +94,7 @@ def measure(
                     "lead": lead_of(result),
                     "support": result.num_inliers / max(result.num_correspondences, 1),
                     "observability": result.evidence.get("observability", 0.0),
+                    "looseness": result.evidence.get("looseness", 1000.0),
                     "evidence": {name: result.evidence[name] for name in names} if result.evidence else None,
                 }
                 known[(source, target, look)] = record
@@ -110,6 +111,12 @@ def lead_of(result: RegistrationResult) -> float:
         return UNRIVALLED_LEAD
     score = result.alternative.relative_score
     return 1 / score if score > 0 else float("inf")
+
+
+def held(record: dict[str, Any]) -> Information:
+    """What a record says of how firmly the answer is held."""
+    unknown = np.full((6, 6), np.nan)
+    return Information(unknown, unknown[0, :3], record["observability"], 0, record["looseness"])
 
 
 def main() -> None:
@@ -129,23 +136,20 @@ def main() -> None:
 
     if given.measured:
         records = [json.loads(line) for line in Path(given.out).read_text().splitlines()]
-        records = [r for r in records if r["assignments"] == given.assignments and "observability" in r]
+        records = [r for r in records if r["assignments"] == given.assignments and "looseness" in r]
     else:
         pairs = draw(given.folders, given.pairs, given.unrelated)
         records = measure(pairs, Path(given.out), given.assignments)
     records = [r for r in records if r["evidence"] is not None]
     X = np.array(
-        [
-            confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"], r["observability"])
-            for r in records
-        ]
+        [confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"], held(r)) for r in records]
     )
     y = np.array([r["right"] for r in records])
     related = np.array([r["related"] for r in records])
     weight = np.where(related, 1.0, UNRELATED_WEIGHT)
     print(f"{related.sum()} related pairs, {y[related].mean():.1%} right; {(~related).sum()} unrelated")
     # On inputs of equal spread the penalty is the same for each. It matters: fitted almost without one, the
-    # coefficients follow the generated rooms too closely, and the verdict, surer there, weighs too much.
+    # coefficients follow the generated rooms too closely.
     model = make_pipeline(StandardScaler(), LogisticRegression())
     p = cross_val_predict(
         model,
@@ -171,9 +175,7 @@ def main() -> None:
     scaler, logistic = model[0], model[1]
     slopes = logistic.coef_[0] / scaler.scale_
     offset = float(logistic.intercept_[0] - slopes @ scaler.mean_)
-    verdicts = "verdict" in records[0]["evidence"]
-    names = (*CONFIDENCE_INPUTS[:-1], "verdict") if verdicts else CONFIDENCE_INPUTS
-    print(f"{', '.join(names)}: {np.round(slopes, 3).tolist()}")
+    print(f"{', '.join(CONFIDENCE_INPUTS)}: {np.round(slopes, 3).tolist()}")
     print(f"offset: {offset:.3f}")
 
 

@@ -221,6 +221,7 @@ def test_information_follows_the_unit_and_observability_does_not(scale: float) -
         T_scaled, prepared(a * scale, VOXEL * scale), prepared(b * scale, VOXEL * scale), VOXEL * scale
     )
     assert scaled.observability == pytest.approx(plain.observability, rel=0.02)
+    assert scaled.looseness == pytest.approx(plain.looseness, rel=0.05)
     units = np.array([scale] * 3 + [1.0] * 3)  # a radian moves a point by its radius
     np.testing.assert_allclose(
         scaled.matrix / np.outer(units, units) * scale**2,
@@ -240,9 +241,21 @@ def test_observability_ignores_where_the_pair_lies_and_how_it_is_turned() -> Non
         measure_information(A @ T, source, moved, VOXEL),
     )
     assert a.observability == pytest.approx(b.observability, rel=1e-6)
+    assert a.looseness == pytest.approx(b.looseness, rel=1e-6)
     np.testing.assert_allclose(b.center, transform_points(A, a.center[None])[0], atol=1e-9)
     turn = np.kron(np.eye(2), A[:3, :3])
     np.testing.assert_allclose(b.matrix, turn @ a.matrix @ turn.T, rtol=1e-6, atol=1e-3 * abs(a.matrix).max())
+
+
+def test_a_sensor_at_the_end_of_a_lever_is_held_loosely() -> None:
+    """Far from what is shared a small turn moves it far; of no known place, the centroid stands for it."""
+    source, target, T = pair(seed=5)
+    centre = source.points.mean(0)
+    at = [replace(source, viewpoint=centre + np.array([x, 0, 0])) for x in (0.0, 3.0, 30.0)]
+    near, far, further = (measure_information(T, one, target, VOXEL).looseness for one in at)
+    assert near == measure_information(T, source, target, VOXEL).looseness
+    assert near < far < further
+    assert further / far == pytest.approx(10, rel=0.2)  # the turn's part grows with the lever
 
 
 def test_too_few_matches_hold_no_information() -> None:
@@ -251,14 +264,15 @@ def test_too_few_matches_hold_no_information() -> None:
     information = measure_information(far, source, target, VOXEL)
     assert information.num_matched == 0
     assert information.observability == 0
+    assert information.looseness == 1000
     assert np.isnan(information.matrix).all()
     assert np.isnan(information.center).all()
 
 
 # ---- judgement ------------------------------------------------------------------------------------------
 
-FIRM = Information(np.eye(6), np.zeros(3), 0.1, 500)
-LOOSE = Information(np.eye(6), np.zeros(3), 0.0, 500)
+FIRM = Information(np.eye(6), np.zeros(3), 0.1, 500, 0.2)
+LOOSE = Information(np.eye(6), np.zeros(3), 0.0, 500, 0.2)
 
 
 def evidence(score: float, overlap: float = 0.6, violation: float = 0.0) -> Evidence:
@@ -288,7 +302,7 @@ def test_a_rival_about_as_good_is_ambiguous() -> None:
     assert judge(evidence(2.0), limit * 1.001, 0.05, FIRM, JudgementConfig()).status != "ambiguous"
     assert judge(evidence(2.0), limit * 0.999, 0.05, FIRM, JudgementConfig()).status == "ambiguous"
     # Where even without a rival nothing would be believed, the rival is not the reason.
-    assert judge(evidence(0.02), 1.1, 0.05, FIRM, JudgementConfig()).status == "low_confidence"
+    assert judge(evidence(0.002), 1.1, 0.05, FIRM, JudgementConfig()).status == "low_confidence"
 
 
 def test_a_surface_that_slides_is_ambiguous_whatever_the_evidence() -> None:
@@ -323,34 +337,39 @@ def test_the_threshold_is_the_users(least: float) -> None:
 
 def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
     scores, leads = np.geomspace(1e-6, 50, 40), [*np.geomspace(0.5, 30, 20), np.inf]
-    table = np.array([[confidence_score(evidence(s), x, 0.05, 0.1) for x in leads] for s in scores])
+    table = np.array([[confidence_score(evidence(s), x, 0.05, FIRM) for x in leads] for s in scores])
     assert ((table >= 0) & (table <= 1)).all()
     assert (np.diff(table, axis=0) >= 0).all()
     assert (np.diff(table, axis=1) >= 0).all()
     assert table[0, 0] < 0.01
     assert table[-1, -1] > 0.999
     assert (
-        confidence_score(evidence(0.0), np.inf, 0.05, 0.1)
-        == confidence_score(evidence(-1.0), 5.0, 0.05, 0.1)
+        confidence_score(evidence(0.0), np.inf, 0.05, FIRM)
+        == confidence_score(evidence(-1.0), 5.0, 0.05, FIRM)
         == 0
     )
 
 
-def test_confidence_rises_with_observability_and_falls_with_violation_up_to_a_bound() -> None:
+def test_confidence_rises_with_hold_and_falls_with_looseness_and_violation_up_to_a_bound() -> None:
     for verdict in (None, 2.0):
         sure = Evidence(0.5, 0.5, 0.3, 0.0, verdict)
-        by_hold = [confidence_score(sure, 3.0, 0.05, x) for x in (0.0, 0.005, 0.05, 0.3)]
+        held = [replace(FIRM, observability=x) for x in (0.0, 0.005, 0.05, 0.3)]
+        by_hold = [confidence_score(sure, 3.0, 0.05, x) for x in held]
         assert np.isfinite(by_hold).all()
         assert (np.diff(by_hold) > 0).all()
+        loose = [replace(FIRM, looseness=x) for x in (0.02, 0.1, 1.0, 10.0, 1000.0)]
+        by_looseness = [confidence_score(sure, 3.0, 0.05, x) for x in loose]
+        assert (np.diff(by_looseness[:4]) < 0).all()
+        assert by_looseness[4] == by_looseness[3]
         floating = [Evidence(0.5, 0.5, 0.3 * np.exp(10 * x), x, verdict) for x in (0.0, 0.02, 0.1, 0.4)]
-        by_violation = [confidence_score(e, 3.0, 0.05, 0.1) for e in floating]  # at equal surface score
+        by_violation = [confidence_score(e, 3.0, 0.05, FIRM) for e in floating]  # at equal surface score
         assert (np.diff(by_violation[:3]) < 0).all()
         assert by_violation[3] == pytest.approx(by_violation[2])
 
 
 def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:
-    by_support = [confidence_score(evidence(0.2), 2.0, x, 0.1) for x in (0, 0.005, 0.02, 0.3)]
-    by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05, 0.1) for x in (0.1, 0.3, 0.9)]
+    by_support = [confidence_score(evidence(0.2), 2.0, x, FIRM) for x in (0, 0.005, 0.02, 0.3)]
+    by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05, FIRM) for x in (0.1, 0.3, 0.9)]
     assert by_support == sorted(set(by_support))
     assert by_overlap == sorted(set(by_overlap), reverse=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -56,6 +56,12 @@ def wall(distance: float = 3.0) -> np.ndarray:
     return np.column_stack([np.full(len(y), distance), y, z])
 
 
+def look_at(image: RangeImage, points: np.ndarray, margin: float) -> tuple[int, int]:
+    """How many points fall where the sensor saw something, and how many of them in front by more."""
+    seen, margins = image.margins(points)
+    return int(seen.sum()), int((margins < -margin).sum())
+
+
 @pytest.mark.parametrize("seed", [None, 0, 1])
 def test_points_before_behind_and_beside_a_wall(seed: int | None) -> None:
     """The answer is the same wherever the sensor stands and however it is turned."""
@@ -76,9 +82,9 @@ def test_points_before_behind_and_beside_a_wall(seed: int | None) -> None:
         (np.vstack([before, near, behind, beside]), (8, 4)),
         (np.zeros((0, 3)), (0, 0)),
     ):
-        assert image.look_at(transform_points(T, points), 0.2) == expected
-    assert image.look_at(transform_points(T, near), 0.01)[1] <= 1
-    assert image.look_at(transform_points(T, before), 5.0) == (4, 0)
+        assert look_at(image, transform_points(T, points), 0.2) == expected
+    assert look_at(image, transform_points(T, near), 0.01)[1] <= 1
+    assert look_at(image, transform_points(T, before), 5.0) == (4, 0)
 
 
 def test_a_surface_never_violates_its_own_free_space() -> None:
@@ -86,7 +92,7 @@ def test_a_surface_never_violates_its_own_free_space() -> None:
     for _ in range(5):
         points = rng.normal(size=(500, 3)) + rng.normal(size=3)
         image = RangeImage.of(points, rng.normal(size=3))
-        assert image.look_at(points, 1e-9) == (500, 0)
+        assert look_at(image, points, 1e-9) == (500, 0)
 
 
 def test_axes_are_a_rotation_and_the_image_counts_every_point() -> None:
@@ -105,7 +111,7 @@ def test_points_on_the_sensor_itself_do_no_harm() -> None:
     points = np.vstack([wall(), np.zeros((1, 3))])
     image = RangeImage.of(points, np.zeros(3))
     assert np.isfinite(image.axes).all()
-    assert image.look_at(np.zeros((3, 3)), 0.1)[0] in (0, 3)
+    assert look_at(image, np.zeros((3, 3)), 0.1)[0] in (0, 3)
     lonely = RangeImage.of(np.zeros((1, 3)), np.zeros(3))
     assert np.isfinite(lonely.axes).all()
 
@@ -297,3 +303,14 @@ def test_another_motion_is_one_that_shifts_or_turns_clearly(pair) -> None:
         later = around_centre(90)
         ranked = [(h, nothing) for h in (*same, other, later)]
         assert clearly_different(ranked, T, source, 0.3)[0] is other
+
+
+def test_hypotheses_asked_together_get_what_each_gets_alone(pair, verifier: Verifier) -> None:
+    T = pair[2]
+    motions = [T, *(turned(30 * k, k % 3, (0.1 * k, 0, 0)) @ T for k in range(1, 13))]
+    ranked = verifier.rank([Hypothesis(motion, 0.0, 0) for motion in motions])
+    assert len(ranked) == len(motions)
+    for hypothesis, evidence in ranked:
+        alone = verifier.evidence(hypothesis.T_target_source)
+        assert astuple(evidence)[:4] == pytest.approx(astuple(alone)[:4], rel=1e-12, abs=1e-12)
+    assert ranked[0][0].T_target_source is T

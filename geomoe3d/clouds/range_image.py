@@ -45,19 +45,6 @@ class RangeImage:
         around = np.minimum(around, np.minimum(padded[:-2], padded[2:]))
         return cls(viewpoint, axes, around, seen)
 
-    def look_at(self, points: FloatArray, margin: float) -> tuple[int, int]:
-        """How many points fall where the sensor saw something, and how many of them in front of it.
-
-        Args:
-            points: (N, 3) points that are claimed to exist.
-            margin: a point counts as in front when it is nearer than the surface seen by more than this.
-
-        Returns:
-            (number in seen directions, number of these that lie in space which the sensor saw through).
-        """
-        seen, margins = self.margins(points)
-        return int(seen.sum()), int((margins < -margin).sum())
-
     def margins(self, points: FloatArray) -> tuple[BoolArray, FloatArray]:
         """For points (N, 3) that are claimed to exist: whether the sensor saw something in their direction,
         and how far they lie behind it (negative: in space which it saw through; infinite where not seen)."""

@@ -38,7 +38,7 @@ FIRST_MOTIONS = 2
 """Motions that are judged before the filter asks itself whether it has seen enough."""
 CONVINCED = 3.0
 """Verdict from which on the filter looks at no further motions."""
-_PARTS = 4  # of a lot, side by side; for any number of threads: last bits depend on how many share a batch
+_PARTS = 2  # of a lot, side by side; for any number of threads: last bits depend on how many share a batch
 
 
 class Judged:

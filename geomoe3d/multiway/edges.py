@@ -14,6 +14,7 @@ import numpy as np
 
 from geomoe3d.batch.store import Outcome
 from geomoe3d.geometry.se3 import cross_matrix, inverse, rotation_angle_deg, shift_frames, transform_points
+from geomoe3d.judge import deviation_at
 from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
 
@@ -82,9 +83,10 @@ def edge_of(outcome: Outcome, source: int, target: int, shapes: list[Shape]) -> 
     origin = shapes[target].origin
     T = shift_frames(result.T_target_source, -shapes[source].origin, -origin)
     matched = max(result.overlap * result.source.num_points, 1.0)
-    information = _about_origin(result.information_matrix, result.information_center - origin)
+    center = result.information_center - origin
+    information = _about_origin(result.information_matrix, center)
     sensor = transform_points(T, shapes[source].sensor[None])[0]
-    looseness = deviation_at(information, sensor)
+    looseness = deviation_at(result.information_matrix, center, sensor)
     information *= matched / max(float(np.trace(result.information_matrix[3:, 3:])), 1e-12)
     # A surface that lets the source slide must not make the graph singular.
     floor = _LEAST_OBSERVABILITY * matched
@@ -142,12 +144,3 @@ def _about_origin(information: FloatArray, center: FloatArray) -> FloatArray:
     A[3:, :3] = -cross_matrix(center)
     moved: FloatArray = A.T @ information @ A
     return moved
-
-
-def deviation_at(information: FloatArray, point: FloatArray) -> float:
-    """Standard deviation of where a motion puts a point, from its information about the same origin."""
-    x, y, z = point
-    J = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])  # p + w x p + v
-    # Never singular: what nothing holds may be anywhere.
-    covariance = np.linalg.inv(information + 1e-12 * np.trace(information) * np.eye(6))
-    return float(np.sqrt(max(np.trace(J @ covariance @ J.T), 0.0)))

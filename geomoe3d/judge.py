@@ -58,8 +58,9 @@ class Information:
         num_matched: matched points.
         looseness: standard deviation of where the motion puts the source's sensor, or its centroid where no
             place is known or guessed, in voxels, if the gaps between the surfaces were independent from point
-            to point. They are not, so it tells a loose fit from a firm one and is no error bar. At most 1000,
-            which is also what stands for fewer than 6 points.
+            to point. They are not, so it tells a loose fit from a firm one and is no error bar. Of the
+            source's sensor alone, so exchanging the scans may change it. At most 1000, which is also what
+            stands for fewer than 6 points.
     """
 
     matrix: FloatArray
@@ -101,10 +102,19 @@ def measure_information(
 
 
 def deviation_at(matrix: FloatArray, center: FloatArray, point: FloatArray) -> float:
-    """Standard deviation of where a motion puts a point (3,), by its information (6, 6) about ``center``."""
-    J = np.hstack([-cross_matrix(point - center), np.eye(3)])  # p + w x (p - c) + v
+    """Standard deviation of where a motion puts a point (3,), by its information (6, 6) about ``center``.
+
+    inf where the matrix holds nothing at all.
+    """
+    turning, shifting = np.trace(matrix[:3, :3]), np.trace(matrix[3:, 3:])
+    if not shifting > 0:
+        return float("inf")
+    # With lengths over the radius of what is shared, what is next to nothing does not depend on the unit.
+    scale = np.array([max(np.sqrt(turning / shifting), 1e-12)] * 3 + [1.0] * 3)
+    scaled = matrix / np.outer(scale, scale)
     # Never singular: what nothing holds may be anywhere.
-    covariance = np.linalg.inv(matrix + 1e-12 * np.trace(matrix) * np.eye(6))
+    J = np.hstack([-cross_matrix(point - center), np.eye(3)]) / scale  # p + w x (p - c) + v
+    covariance = np.linalg.inv(scaled + 1e-12 * np.trace(scaled) * np.eye(6))
     return float(np.sqrt(max(np.trace(J @ covariance @ J.T), 0.0)))
 
 

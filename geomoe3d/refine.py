@@ -24,7 +24,9 @@ _MARGIN_VOXELS = (
     2.5  # beyond the reach: points may come nearer in the course, and normals need their neighbours
 )
 _NORMAL_NEIGHBORS = 20
-_STILL_VOXELS = 0.01  # a step that moves less ends it; ten times less takes twice the steps for nothing
+# A step that moves less (and turns less than 0.1 deg, the library's own) ends it; ten times less takes twice
+# the steps for nothing.
+_STILL_VOXELS = 0.01
 
 
 class Refiner:

@@ -258,6 +258,25 @@ def test_a_sensor_at_the_end_of_a_lever_is_held_loosely() -> None:
     assert further / far == pytest.approx(10, rel=0.2)  # the turn's part grows with the lever
 
 
+@pytest.mark.parametrize("kind", ["plane", "channel", "corner"])
+def test_looseness_does_not_depend_on_the_unit_even_where_the_surface_slides(kind: str) -> None:
+    T = motion(3)
+    a, b = surfaces(kind, 0), transform_points(T, surfaces(kind, 1))
+    found = []
+    for scale in (1.0, 1e4):
+        moved = T.copy()
+        moved[:3, 3] *= scale
+        source, target = (prepared(points * scale, VOXEL * scale) for points in (a, b))
+        found.append(measure_information(moved, source, target, VOXEL * scale).looseness)
+    assert found[1] == pytest.approx(found[0], rel=0.05)
+
+
+def test_surfaces_without_normals_hold_nothing() -> None:
+    source, target, T = pair()
+    blank = replace(target, normals=np.zeros_like(target.normals))
+    assert measure_information(T, source, blank, VOXEL).looseness == 1000
+
+
 def test_too_few_matches_hold_no_information() -> None:
     source, target, T = pair()
     far = perturbation(np.zeros(3), np.array([50.0, 0, 0]), np.zeros(3)) @ T
@@ -365,6 +384,12 @@ def test_confidence_rises_with_hold_and_falls_with_looseness_and_violation_up_to
         by_violation = [confidence_score(e, 3.0, 0.05, FIRM) for e in floating]  # at equal surface score
         assert (np.diff(by_violation[:3]) < 0).all()
         assert by_violation[3] == pytest.approx(by_violation[2])
+
+
+def test_the_networks_verdict_counts_by_the_lead_alone() -> None:
+    """It says what fits better, of motions of the same scans; how sure it is by itself is not believed."""
+    at = [confidence_score(Evidence(0.5, 0.5, 0.3, 0.0, x), 3.0, 0.05, FIRM) for x in (-5.0, 2.0)]
+    assert at[0] == at[1]
 
 
 def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:

@@ -308,6 +308,7 @@ def test_another_motion_is_one_that_shifts_or_turns_clearly(pair) -> None:
 def test_hypotheses_asked_together_get_what_each_gets_alone(pair, verifier: Verifier) -> None:
     T = pair[2]
     motions = [T, *(turned(30 * k, k % 3, (0.1 * k, 0, 0)) @ T for k in range(1, 13))]
+    motions.insert(7, turned(0, 0, (100, 0, 0)) @ T)  # where nothing meets
     ranked = verifier.rank([Hypothesis(motion, 0.0, 0) for motion in motions])
     assert len(ranked) == len(motions)
     for hypothesis, evidence in ranked:

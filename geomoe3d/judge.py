@@ -20,13 +20,18 @@ from geomoe3d.verification import Evidence
 # Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
 # one, mixed by overlap as the benchmarks are, and on unrelated pairs: 300 and 150 pairs, each with one look
 # and with two; docs/measurements.md holds what came of it on real scans.
-_OFFSET = -1.216
-_SLOPES = np.array([0.888, 2.244, -3.972, 0.435, -3.014, 1.249, -74.871])
-_OFFSET_WITH_VERDICT = -1.887
-_SLOPES_WITH_VERDICT = np.array([1.187, 1.083, -3.13, 0.756, -2.423, 0.488, -71.387])
+# Offset and slopes by (heard a network, asked free space): where it is not known what must be empty, the same
+# evidence is worth less.
+_COEFFICIENTS = {
+    (True, True): (-1.887, np.array([1.187, 1.083, -3.13, 0.756, -2.423, 0.488, -71.387])),
+    (False, True): (-1.216, np.array([0.888, 2.244, -3.972, 0.435, -3.014, 1.249, -74.871])),
+    (True, False): (-7.984, np.array([1.953, 1.534, -4.965, 0.444, -2.722, 0.169, 0.0])),
+    (False, False): (-1.976, np.array([1.813, 3.895, -5.902, 1.117, -2.994, 1.447, 0.0])),
+}
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002, 0.01, 1e-3
 _LEAST_LOOSENESS, _MOST_LOOSENESS = 0.02, 10.0
 _LOOSEST = 1000.0
+_ASKED = 200  # points of a scan of unknown sensor whose deviation is asked for
 _MOST_LEAD = 30.0
 _MOST_VIOLATION = 0.1
 UNRIVALLED_LEAD = 3.0
@@ -56,11 +61,12 @@ class Information:
         observability: smallest eigenvalue of the same sum per point with lengths divided by the root mean
             square radius; 1/3 would be held equally from all sides, 0 means that the source can slide.
         num_matched: matched points.
-        looseness: standard deviation of where the motion puts the source's sensor, or its centroid where no
-            place is known or guessed, in voxels, if the gaps between the surfaces were independent from point
-            to point. They are not, so it tells a loose fit from a firm one and is no error bar. Of the
-            source's sensor alone, so exchanging the scans may change it. At most 1000, which is also what
-            stands for fewer than 6 points.
+        looseness: standard deviation of where the motion puts the source's sensor, in voxels, if the gaps
+            between the surfaces were independent from point to point; where no place is known or guessed, of
+            the most loosely held twentieth of its points. They are not independent, so it tells a loose fit
+            from a firm one and is no error bar. Of the source alone, so exchanging the scans may change it.
+            At most 1000, which is also what stands for fewer than 6 points.
+        sensors_known: whether both sensors' places are known or guessed, so that free space could be asked.
     """
 
     matrix: FloatArray
@@ -68,6 +74,7 @@ class Information:
     observability: float
     num_matched: int
     looseness: float = _LOOSEST
+    sensors_known: bool = True
 
 
 def measure_information(
@@ -79,12 +86,13 @@ def measure_information(
     """
     from scipy.spatial import cKDTree
 
+    known = source.viewpoint is not None and target.viewpoint is not None
     moved = transform_points(T_target_source, source.points)
     distance, nearest = cKDTree(target.points).query(moved, distance_upper_bound=threshold)
     distance, nearest = np.asarray(distance), np.asarray(nearest)
     hit = np.isfinite(distance)
     if hit.sum() < 6:
-        return Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, int(hit.sum()))
+        return Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, int(hit.sum()), _LOOSEST, known)
     points, normals = moved[hit], target.normals[nearest[hit]]
     gaps = np.einsum("ij,ij->i", points - target.points[nearest[hit]], normals)
     center = points.mean(0)
@@ -95,27 +103,32 @@ def measure_information(
     scaled = J / np.array([radius] * 3 + [1.0] * 3)
     smallest = float(np.linalg.eigvalsh(scaled.T @ scaled / len(points))[0])
     matrix = J.T @ J / variance
-    place = source.points.mean(0) if source.viewpoint is None else source.viewpoint
-    sensor = transform_points(T_target_source, place[None])[0]
-    looseness = deviation_at(matrix, center, sensor) / source.voxel_size
-    return Information(matrix, center, max(smallest, 0.0), int(hit.sum()), min(looseness, _LOOSEST))
+    places = source.points[:: -(-len(source) // _ASKED)]
+    if source.viewpoint is not None:
+        places = source.viewpoint[None]
+    deviations = deviations_at(matrix, center, transform_points(T_target_source, places)) / source.voxel_size
+    looseness = float(np.quantile(np.minimum(deviations, _LOOSEST), 0.95))
+    return Information(matrix, center, max(smallest, 0.0), int(hit.sum()), looseness, known)
 
 
-def deviation_at(matrix: FloatArray, center: FloatArray, point: FloatArray) -> float:
-    """Standard deviation of where a motion puts a point (3,), by its information (6, 6) about ``center``.
+def deviations_at(matrix: FloatArray, center: FloatArray, points: FloatArray) -> FloatArray:
+    """Standard deviations (n,) of where a motion puts points (n, 3), by its information about ``center``.
 
     inf where the matrix holds nothing at all.
     """
     turning, shifting = np.trace(matrix[:3, :3]), np.trace(matrix[3:, 3:])
     if not shifting > 0:
-        return float("inf")
+        return np.full(len(points), np.inf)
     # With lengths over the radius of what is shared, what is next to nothing does not depend on the unit.
     scale = np.array([max(np.sqrt(turning / shifting), 1e-12)] * 3 + [1.0] * 3)
     scaled = matrix / np.outer(scale, scale)
     # Never singular: what nothing holds may be anywhere.
-    J = np.hstack([-cross_matrix(point - center), np.eye(3)]) / scale  # p + w x (p - c) + v
     covariance = np.linalg.inv(scaled + 1e-12 * np.trace(scaled) * np.eye(6))
-    return float(np.sqrt(max(np.trace(J @ covariance @ J.T), 0.0)))
+    # p + w x (p - c) + v
+    J = np.array([np.hstack([-cross_matrix(point - center), np.eye(3)]) for point in points]) / scale
+    variance = np.einsum("nij,jk,nik->n", J, covariance, J)
+    deviations: FloatArray = np.sqrt(np.maximum(variance, 0.0))
+    return deviations
 
 
 def judge(
@@ -237,8 +250,6 @@ def confidence_score(evidence: Evidence, lead: float, support: float, informatio
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
     if evidence.score <= 0:
         return 0.0
-    offset, slopes = _OFFSET, _SLOPES
-    if evidence.verdict is not None:
-        offset, slopes = _OFFSET_WITH_VERDICT, _SLOPES_WITH_VERDICT
+    offset, slopes = _COEFFICIENTS[evidence.verdict is not None, information.sensors_known]
     strength = offset + confidence_inputs(evidence, lead, support, information) @ slopes
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

@@ -1,7 +1,7 @@
 """Fits the confidence: P(the answer is right) as a logistic function of what the clouds say of it.
 
     python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 250] [--set filter.name=none]
-        [--out runs/confidence.jsonl]
+        [--set preparation.viewpoint=centroid] [--out runs/confidence.jsonl]
 
 FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
 recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix them, unrelated ones from

@@ -29,7 +29,7 @@ from geomoe3d.geometry.se3 import (
     transform_points,
 )
 from geomoe3d.journal import read_journal
-from geomoe3d.judge import deviation_at
+from geomoe3d.judge import deviations_at
 from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.edges import Edge, Shape, agrees, displacement, expected_error
 from geomoe3d.multiway.formats import quaternion, right_information
@@ -389,10 +389,10 @@ def test_looseness_is_the_deviation_of_the_sensor():
         w, v = np.split(np.linalg.lstsq(J, 0.01 * rng.normal(size=300), rcond=None)[0], 2)
         moved.append(np.cross(w, sensor) + v)
     expected = np.sqrt((np.array(moved) ** 2).sum(1).mean())
-    assert deviation_at(J.T @ J / 0.01**2, np.zeros(3), sensor) == pytest.approx(expected, rel=0.03)
+    assert deviations_at(J.T @ J / 0.01**2, np.zeros(3), sensor[None])[0] == pytest.approx(expected, rel=0.03)
     center = np.array([0.5, 0.2, 2.0])  # the same information about another point
     J = np.hstack([np.cross(points - center, normals), normals])
-    assert deviation_at(J.T @ J / 0.01**2, center, sensor) == pytest.approx(expected, rel=0.03)
+    assert deviations_at(J.T @ J / 0.01**2, center, sensor[None])[0] == pytest.approx(expected, rel=0.03)
     shape = Shape.of(points, np.zeros(3), sensor)
     T = make_transform(Rotation.from_rotvec([0.1, 0, 0]).as_matrix(), np.array([0.2, 0, 0]))
     one = Edge(1, 0, T, 0.9, np.eye(6), looseness=0.02)

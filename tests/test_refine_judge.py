@@ -248,14 +248,19 @@ def test_observability_ignores_where_the_pair_lies_and_how_it_is_turned() -> Non
 
 
 def test_a_sensor_at_the_end_of_a_lever_is_held_loosely() -> None:
-    """Far from what is shared a small turn moves it far; of no known place, the centroid stands for it."""
+    """Far from what is shared a small turn moves it far; of no known place, far points stand for it."""
     source, target, T = pair(seed=5)
     centre = source.points.mean(0)
     at = [replace(source, viewpoint=centre + np.array([x, 0, 0])) for x in (0.0, 3.0, 30.0)]
     near, far, further = (measure_information(T, one, target, VOXEL).looseness for one in at)
-    assert near == measure_information(T, source, target, VOXEL).looseness
     assert near < far < further
     assert further / far == pytest.approx(10, rel=0.2)  # the turn's part grows with the lever
+    of_all = [
+        measure_information(T, replace(source, viewpoint=place), target, VOXEL).looseness
+        for place in source.points[::20]
+    ]
+    unknown = measure_information(T, source, target, VOXEL).looseness
+    assert unknown == pytest.approx(np.quantile(of_all, 0.95), rel=0.05)
 
 
 @pytest.mark.parametrize("kind", ["plane", "channel", "corner"])
@@ -384,6 +389,22 @@ def test_confidence_rises_with_hold_and_falls_with_looseness_and_violation_up_to
         by_violation = [confidence_score(e, 3.0, 0.05, FIRM) for e in floating]  # at equal surface score
         assert (np.diff(by_violation[:3]) < 0).all()
         assert by_violation[3] == pytest.approx(by_violation[2])
+
+
+@pytest.mark.parametrize("verdict", [None, 2.0])
+def test_where_free_space_was_not_asked_the_same_evidence_is_worth_less(verdict: float | None) -> None:
+    found = Evidence(0.3, 0.3, 0.25, 0.0, verdict)
+    blind = replace(FIRM, sensors_known=False)
+    for lead in (1.0, 1.5, 3.0):
+        assert confidence_score(found, lead, 0.05, blind) < confidence_score(found, lead, 0.05, FIRM)
+
+
+def test_information_says_whether_the_sensors_are_known() -> None:
+    source, target, T = pair(seed=5)
+    place = np.zeros(3)
+    for one, other, known in ((None, None, False), (place, None, False), (place, place, True)):
+        two = replace(source, viewpoint=one), replace(target, viewpoint=other)
+        assert measure_information(T, *two, VOXEL).sensors_known == known
 
 
 def test_the_networks_verdict_counts_by_the_lead_alone() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from geomoe3d.batch.store import Outcome
 from geomoe3d.geometry.se3 import cross_matrix, inverse, rotation_angle_deg, shift_frames, transform_points
-from geomoe3d.judge import deviation_at
+from geomoe3d.judge import deviations_at
 from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
 
@@ -85,8 +85,8 @@ def edge_of(outcome: Outcome, source: int, target: int, shapes: list[Shape]) -> 
     matched = max(result.overlap * result.source.num_points, 1.0)
     center = result.information_center - origin
     information = _about_origin(result.information_matrix, center)
-    sensor = transform_points(T, shapes[source].sensor[None])[0]
-    looseness = deviation_at(result.information_matrix, center, sensor)
+    sensor = transform_points(T, shapes[source].sensor[None])
+    looseness = float(deviations_at(result.information_matrix, center, sensor)[0])
     information *= matched / max(float(np.trace(result.information_matrix[3:, 3:])), 1e-12)
     # A surface that lets the source slide must not make the graph singular.
     floor = _LEAST_OBSERVABILITY * matched

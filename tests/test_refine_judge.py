@@ -295,8 +295,8 @@ def test_too_few_matches_hold_no_information() -> None:
 
 # ---- judgement ------------------------------------------------------------------------------------------
 
-FIRM = Information(np.eye(6), np.zeros(3), 0.1, 500, 0.2)
-LOOSE = Information(np.eye(6), np.zeros(3), 0.0, 500, 0.2)
+FIRM = Information(np.eye(6), np.zeros(3), 0.1, 500, 0.2, sensors_known=True)
+LOOSE = Information(np.eye(6), np.zeros(3), 0.0, 500, 0.2, sensors_known=True)
 
 
 def evidence(score: float, overlap: float = 0.6, violation: float = 0.0) -> Evidence:

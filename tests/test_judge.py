@@ -1,4 +1,4 @@
-"""Refinement, the information of a fit, and the judgement: documented rules, derivatives, monotony."""
+"""The information of a fit and the judgement: derivatives, monotony, documented rules."""
 
 from __future__ import annotations
 
@@ -9,152 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+from surface_pairs import VOXEL, motion, pair, perturbation, prepared, surfaces
 
 import geomoe3d
-from geomoe3d.answer import Findings
-from geomoe3d.clouds.prepare import prepare
-from geomoe3d.config import JudgementConfig, PreparationConfig, RefinementConfig
+from geomoe3d.config import JudgementConfig
 from geomoe3d.data.sample import make_sample_pair
-from geomoe3d.geometry.se3 import (
-    inverse,
-    make_transform,
-    rotation_error_deg,
-    transform_points,
-    translation_error,
-)
+from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
 from geomoe3d.judge import Information, confidence_score, judge, lead_over, measure_information
-from geomoe3d.refine import refine
-from geomoe3d.stages import StageClock
-from geomoe3d.types import Correspondences, PointCloud, PreparedCloud
 from geomoe3d.verification import Evidence
-
-VOXEL = 0.1
-METHODS = ["icp", "gicp"]
-
-
-def perturbation(rotation: np.ndarray, translation: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """p -> exp(rotation) (p - center) + center + translation."""
-    R = Rotation.from_rotvec(rotation).as_matrix()
-    return make_transform(R, center + translation - R @ center)
-
-
-def surfaces(kind: str, seed: int = 0, count: int = 12_000) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(0, 3, (count, 3))
-    if kind == "corner":
-        points[np.arange(count), rng.integers(0, 3, count)] = 0
-    elif kind == "plane":
-        points[:, 2] = 0
-    elif kind == "channel":  # two planes: slides along their common line
-        points[np.arange(count), rng.integers(0, 2, count)] = 0
-    elif kind == "cylinder":
-        angle = rng.uniform(0, 2 * np.pi, count)
-        points[:, 0], points[:, 1] = np.cos(angle), np.sin(angle)
-    elif kind == "sphere":
-        points = points - 1.5
-        points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return points
-
-
-def prepared(points: np.ndarray, voxel: float = VOXEL) -> PreparedCloud:
-    return prepare(PointCloud(points), voxel, PreparationConfig(viewpoint="centroid"))
-
-
-def motion(seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return make_transform(Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3) * 3)
-
-
-def pair(kind: str = "corner", seed: int = 0) -> tuple[PreparedCloud, PreparedCloud, np.ndarray]:
-    """Two samples of one surface, and the motion between them."""
-    T = motion(seed + 1)
-    source, target = surfaces(kind, 2 * seed), surfaces(kind, 2 * seed + 1)
-    return prepared(source), prepared(transform_points(T, target)), T
-
-
-# ---- refinement -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("seed", range(3))
-def test_refinement_finds_the_motion_from_nearby(method: str, seed: int) -> None:
-    source, target, T = pair(seed=seed)
-    rng = np.random.default_rng(seed)
-    axis = rng.normal(size=3)
-    centre = transform_points(T, source.points.mean(0)[None])[0]
-    start = perturbation(np.radians(2) * axis / np.linalg.norm(axis), rng.normal(size=3) * 0.03, centre) @ T
-    refined, note = refine(start, source, target, RefinementConfig(method=method))
-    assert note is None
-    assert rotation_error_deg(refined, T) < 0.2 < rotation_error_deg(start, T)
-    assert translation_error(refined, T) < 0.02
-    np.testing.assert_allclose(refined[:3, :3] @ refined[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(refined[:3, :3]) == pytest.approx(1)
-    np.testing.assert_array_equal(refined[3], [0, 0, 0, 1])
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_refinement_does_not_mind_the_unit(method: str, scale: float) -> None:
-    T = motion(1)
-    a, b = surfaces("corner", 0), transform_points(T, surfaces("corner", 1))
-    start = perturbation(np.radians([1.0, -1, 1]), np.full(3, 0.02), b.mean(0)) @ T
-    config = RefinementConfig(method=method)
-    plain, _ = refine(start, prepared(a), prepared(b), config)
-    scaled_start = start.copy()
-    scaled_start[:3, 3] *= scale
-    scaled, note = refine(
-        scaled_start, prepared(a * scale, VOXEL * scale), prepared(b * scale, VOXEL * scale), config
-    )
-    assert note is None
-    assert rotation_error_deg(plain, scaled) < 0.01
-    np.testing.assert_allclose(scaled[:3, 3] / scale, plain[:3, 3], atol=1e-3)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_refinement_gives_the_same_bytes_twice_and_changes_no_input(method: str) -> None:
-    source, target, T = pair()
-    start, points = T.copy(), source.points.copy()
-    config = RefinementConfig(method=method)
-    a, b = (refine(start, source, target, config)[0] for _ in range(2))
-    assert a.tobytes() == b.tobytes()
-    np.testing.assert_array_equal(start, T)
-    np.testing.assert_array_equal(source.points, points)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_where_nothing_matches_the_start_is_given_with_a_reason(method: str) -> None:
-    source, target, T = pair()
-    start = perturbation(np.zeros(3), np.array([100.0, 0, 0]), np.zeros(3)) @ T
-    found, note = refine(start, source, target, RefinementConfig(method=method))
-    np.testing.assert_array_equal(found, start)
-    assert re.search(r"found only 0 matching points \(it needs 10\)", note)
-
-
-def test_a_refinement_that_slides_away_is_thrown_away() -> None:
-    """On a plane's edge with a huge reach the source is drawn far from where it was put."""
-    source, target, T = pair()
-    start = perturbation(np.radians([0.0, 0, 25]), np.zeros(3), np.zeros(3)) @ T
-    found, note = refine(start, source, target, RefinementConfig(max_distance=50, max_iterations=200))
-    np.testing.assert_array_equal(found, start)
-    assert re.search(r"slid away by [\d.]+ deg and [\d.]+ voxels", note)
-
-
-def test_no_refinement_gives_the_very_start() -> None:
-    source, target, T = pair()
-    assert refine(T, source, target, RefinementConfig(method="none")) == (T, None)
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("count", [3, 5, 12])
-def test_tiny_clouds_do_not_bring_refinement_down(method: str, count: int) -> None:
-    points = np.random.default_rng(count).uniform(0, 0.3, (count, 3))
-    tiny = PreparedCloud(points, np.tile([0.0, 0, 1], (count, 1)), None, VOXEL, None, np.zeros(3))
-    found, note = refine(np.eye(4), tiny, tiny, RefinementConfig(method=method))
-    assert np.isfinite(found).all()
-    assert note is not None or count >= 10
-    np.testing.assert_allclose(found, np.eye(4), atol=1e-3)
-
 
 # ---- the information of a fit ---------------------------------------------------------------------------
 
@@ -293,7 +155,16 @@ def test_too_few_matches_hold_no_information() -> None:
     assert np.isnan(information.center).all()
 
 
+def test_information_says_whether_the_sensors_are_known() -> None:
+    source, target, T = pair(seed=5)
+    place = np.zeros(3)
+    for one, other, known in ((None, None, False), (place, None, False), (place, place, True)):
+        two = replace(source, viewpoint=one), replace(target, viewpoint=other)
+        assert measure_information(T, *two, VOXEL).sensors_known == known
+
+
 # ---- judgement ------------------------------------------------------------------------------------------
+
 
 FIRM = Information(np.eye(6), np.zeros(3), 0.1, 500, 0.2, sensors_known=True)
 LOOSE = Information(np.eye(6), np.zeros(3), 0.0, 500, 0.2, sensors_known=True)
@@ -399,14 +270,6 @@ def test_where_free_space_was_not_asked_the_same_evidence_is_worth_less(verdict:
         assert confidence_score(found, lead, 0.05, blind) < confidence_score(found, lead, 0.05, FIRM)
 
 
-def test_information_says_whether_the_sensors_are_known() -> None:
-    source, target, T = pair(seed=5)
-    place = np.zeros(3)
-    for one, other, known in ((None, None, False), (place, None, False), (place, place, True)):
-        two = replace(source, viewpoint=one), replace(target, viewpoint=other)
-        assert measure_information(T, *two, VOXEL).sensors_known == known
-
-
 def test_the_networks_verdict_counts_by_the_lead_alone() -> None:
     """It says what fits better, of motions of the same scans; how sure it is by itself is not believed."""
     at = [confidence_score(Evidence(0.5, 0.5, 0.3, 0.0, x), 3.0, 0.05, FIRM) for x in (-5.0, 2.0)]
@@ -449,9 +312,6 @@ def test_a_scene_that_stands_twice_in_the_target_is_ambiguous(name: str, least: 
     assert other.relative_score > least  # the clouds like both alike; a network may prefer one
 
 
-# ---- findings and the clock ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("surface", "verdicts", "status"),
     [(0.8, (3.0, 1.5), "ambiguous"), (0.8, (6.0, -3.0), "ok"), (0.3, (6.0, 4.5), "ok")],
@@ -464,37 +324,3 @@ def test_a_rival_makes_ambiguous_only_where_clouds_and_network_like_it_alike(
     rival = replace(evidence(surface, overlap=0.5), verdict=verdicts[1])
     judged = judge(mine, 5.0, 0.3, FIRM, JudgementConfig(min_confidence=0.5), rival)
     assert judged.status == status
-
-
-def test_nothing_found_holds_no_transform() -> None:
-    nothing = Findings.nothing("no motion")
-    assert np.isnan(nothing.T_target_source).all()
-    assert nothing.judgement.status == "failed"
-    assert nothing.judgement.confidence == 0
-    assert nothing.judgement.reasons == ("no motion",)
-    residuals = nothing.residuals(Correspondences(np.zeros((4, 6))))
-    assert (residuals == np.inf).all()
-    assert residuals.shape == (4,)
-
-
-def test_residuals_are_distances_after_the_motion() -> None:
-    T, rng = motion(5), np.random.default_rng(5)
-    source, gaps = rng.normal(size=(6, 3)), rng.normal(size=(6, 3))
-    rows = Correspondences(np.hstack([source, transform_points(T, source) + gaps]))
-    found = replace(Findings.nothing(""), T_target_source=T, evidence=evidence(1.0))
-    np.testing.assert_allclose(found.residuals(rows), np.linalg.norm(gaps, axis=1))
-    exchanged = Correspondences(rows.points[:, [3, 4, 5, 0, 1, 2]])
-    back = replace(found, T_target_source=inverse(T))
-    np.testing.assert_allclose(back.residuals(exchanged), np.linalg.norm(gaps, axis=1))
-
-
-def test_the_clock_adds_up_and_tells_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticks = iter([0.0, 1.0, 3.0, 6.0, 10.0])
-    monkeypatch.setattr("geomoe3d.stages.time.perf_counter", lambda: next(ticks))
-    told: list[str] = []
-    clock = StageClock(told.append)
-    clock("load")
-    clock("solve")
-    clock("load")
-    assert clock.stop() == {"load": 2.0 + 4.0, "solve": 3.0, "total": 10.0}
-    assert told == ["load", "solve", "load"]

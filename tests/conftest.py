@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 
 
 @pytest.fixture(scope="module")
@@ -16,3 +20,13 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def two_runs(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> list[tuple[RunScore, list[EvaluationPair], list[Prediction]]]:
+    """Two made-up runs of the same pairs, for the reports of an evaluation."""
+    from report_runs import make_pairs, make_two_runs
+
+    return make_two_runs(make_pairs(tmp_path_factory.mktemp("clouds")))

@@ -1,156 +1,35 @@
-"""Estimators alone on correspondences: recovery, invariances, degenerate and invalid input, determinism."""
+"""What every estimator keeps to: invariances, degenerate and invalid input, the same answer every time."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-import tracemalloc
 
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
-from scipy.spatial.transform import Rotation
+from estimator_problems import (
+    ALL,
+    CONSENSUS,
+    RANSAC,
+    ROBUST,
+    SVD,
+    THRESHOLD,
+    assert_motion,
+    line,
+    problem,
+    random_motion,
+    room_points,
+)
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import InputError
-from geomoe3d.estimators import consensus
 from geomoe3d.estimators.base import make_estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
 from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
 from geomoe3d.geometry.rigid_fit import spread
-from geomoe3d.geometry.se3 import (
-    inverse,
-    make_transform,
-    rotation_error_deg,
-    transform_points,
-    translation_error,
-)
-
-THRESHOLD = 0.1
-CONSENSUS = ConsensusEstimator(num_seeds=100)
-RANSAC = RansacEstimator(iterations=5000)
-SVD = WeightedSvdEstimator()
-SVD_REFITS = WeightedSvdEstimator(num_refits=10)
-ALL = pytest.mark.parametrize("estimator", [CONSENSUS, RANSAC, SVD], ids=["consensus", "ransac", "svd"])
-ROBUST = pytest.mark.parametrize("estimator", [CONSENSUS, RANSAC], ids=["consensus", "ransac"])
-
-
-def random_motion(seed: int, reach: float = 3.0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return make_transform(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3) * reach)
-
-
-def room_points(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Points on the floor, two walls and a box of a 5 x 4 x 2.5 m room."""
-    points = rng.uniform(0, 1, (count, 3)) * [5, 4, 2.5]
-    face = rng.integers(0, 4, count)
-    points[face == 0, 2], points[face == 1, 0], points[face == 2, 1] = 0, 0, 4
-    box = face == 3
-    points[box] = points[box] * 0.25 + [2, 1, 0]
-    return points
-
-
-def problem(
-    seed: int, count: int = 600, inliers: float = 0.1, noise: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Correspondences, the true motion and which rows are true.
-
-    Of the wrong rows a third is random, a third falls in bundles on few target points, and a third lies on
-    the right walls but slid along them, which preserves many lengths nearly.
-    """
-    rng = np.random.default_rng(seed)
-    T = random_motion(seed + 1000)
-    source = room_points(rng, count)
-    target = source.copy()
-    true = np.zeros(count, dtype=bool)
-    true[rng.permutation(count)[: round(inliers * count)]] = True
-    wrong = np.flatnonzero(~true)
-    random, bundled, slid = np.array_split(wrong, 3)
-    target[random] = room_points(rng, len(random))
-    target[bundled] = room_points(rng, max(3, len(bundled) // 10))[
-        rng.integers(0, max(3, len(bundled) // 10), len(bundled))
-    ]
-    target[slid] += rng.uniform(0.3, 1.5, (len(slid), 1)) * np.eye(3)[rng.integers(0, 3, len(slid))]
-    target += noise * rng.normal(size=target.shape)
-    return np.hstack([source, transform_points(T, target)]), T, true
-
-
-def assert_motion(
-    found: np.ndarray, expected: np.ndarray, degrees: float = 1e-4, length: float = 1e-5
-) -> None:
-    assert rotation_error_deg(found, expected) < degrees
-    assert translation_error(found, expected) < length
-    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-9)
-    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
-
-
-# ---- recovery ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_consensus_recovers_the_exact_motion_among_90_percent_structured_outliers(seed: int) -> None:
-    rows, T, true = problem(seed)
-    found = CONSENSUS(rows, inlier_threshold=THRESHOLD)
-    assert_motion(found[0].T_target_source, T, degrees=0.2, length=0.02)
-    # Outliers that agree with the motion by chance pull a little; without them the fit is exact.
-    residuals = np.linalg.norm(transform_points(T, rows[:, :3]) - rows[:, 3:], axis=1)
-    clean = true | (residuals > 2 * THRESHOLD)
-    found = CONSENSUS(rows[clean], inlier_threshold=THRESHOLD)
-    assert_motion(found[0].T_target_source, T)
-    assert found[0].num_inliers == true.sum()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_consensus_finds_few_noisy_inliers(seed: int) -> None:
-    rows, T, true = problem(seed, count=1000, inliers=0.04, noise=0.01)
-    found = ConsensusEstimator()(rows, inlier_threshold=THRESHOLD)
-    assert_motion(found[0].T_target_source, T, degrees=2, length=0.1)
-    assert found[0].num_inliers >= 0.9 * true.sum()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_ransac_recovers_the_motion_among_half_outliers(seed: int) -> None:
-    rows, T, true = problem(seed, inliers=0.5, noise=0.005)
-    found = RANSAC(rows, inlier_threshold=THRESHOLD, seed=seed)
-    assert len(found) == 1
-    assert_motion(found[0].T_target_source, T, degrees=1, length=0.1)
-    assert found[0].num_inliers >= 0.95 * true.sum()
-
-
-def test_svd_is_exact_without_outliers_and_with_weights_that_remove_them() -> None:
-    rows, T, true = problem(5, inliers=0.3)
-    for found in (
-        SVD(rows[true], inlier_threshold=THRESHOLD),
-        SVD(rows, true.astype(float), inlier_threshold=THRESHOLD),
-    ):
-        assert_motion(found[0].T_target_source, T, degrees=1e-9, length=1e-10)
-        assert found[0].score == pytest.approx(true.sum(), rel=1e-9)
-
-
-def test_svd_equals_scipy_on_noisy_weighted_rows() -> None:
-    rows, _, true = problem(6, inliers=0.5, noise=0.3)
-    rows, weights = rows[true], np.random.default_rng(6).random(true.sum())
-    means = np.average(rows, axis=0, weights=weights)
-    oracle, _ = Rotation.align_vectors(*(rows - means)[:, [[3, 4, 5], [0, 1, 2]]].swapaxes(0, 1), weights)
-    R = oracle.as_matrix()
-    found = SVD(rows, weights, inlier_threshold=THRESHOLD)
-    assert_motion(
-        found[0].T_target_source, make_transform(R, means[3:] - R @ means[:3]), degrees=1e-6, length=1e-8
-    )
-
-
-def test_refits_of_svd_shake_off_a_few_outliers() -> None:
-    rows, T, true = problem(7, inliers=0.9, noise=0.005)
-    rows[~true, 3:] = rows[true, 3:].mean(0) + 0.3 * (rows[~true, 3:] - rows[true, 3:].mean(0))
-    threshold = 0.5
-    errors = [
-        rotation_error_deg(e(rows, inlier_threshold=threshold)[0].T_target_source, T)
-        for e in (SVD, SVD_REFITS)
-    ]
-    assert errors[1] < 0.2 * errors[0]
-    assert errors[1] < 0.3
+from geomoe3d.geometry.se3 import inverse, transform_points
 
 
 @ALL
@@ -161,61 +40,6 @@ def test_three_correspondences_are_enough(estimator, seed: int) -> None:
     found = estimator(np.hstack([source, transform_points(T, source)]), inlier_threshold=THRESHOLD)
     assert_motion(found[0].T_target_source, T, degrees=1e-3, length=1e-4)
     assert found[0].num_inliers == 3
-
-
-@pytest.mark.parametrize(
-    ("count", "first", "second"),
-    [(500, 300, 200), (2000, 400, 300), (2000, 600, 400)],
-    ids=["all rows true", "more wrong rows than true", "more rows of the first motion than seeds"],
-)
-def test_consensus_keeps_two_motions_of_a_scene_best_first(count: int, first: int, second: int) -> None:
-    """As in a building with two rooms alike: the second motion is what tells that the answer is ambiguous."""
-    rng = np.random.default_rng(20)
-    A, B = random_motion(21), random_motion(22)
-    source = room_points(rng, count)
-    moved = transform_points(A, source)
-    moved[first:] = transform_points(B, source[first:])
-    moved[first + second :] = transform_points(A, room_points(rng, count - first - second))
-    moved += 0.005 * rng.normal(size=moved.shape)
-    mixed = rng.permutation(count)
-    rows = np.hstack([source, moved])[mixed]
-    found = ConsensusEstimator()(rows, inlier_threshold=THRESHOLD)
-    assert_motion(found[0].T_target_source, A, degrees=0.5, length=0.05)
-    assert len(found) >= 2
-    assert_motion(found[1].T_target_source, B, degrees=0.5, length=0.05)
-    assert found[0].num_inliers == pytest.approx(first, abs=10)
-    assert found[1].num_inliers == pytest.approx(second, abs=10)
-    # Weights decide which of the two comes first.
-    weights = np.where(np.arange(count) < first, 0.2, 1.0)[mixed]
-    found = ConsensusEstimator()(rows, weights, inlier_threshold=THRESHOLD)
-    assert_motion(found[0].T_target_source, B, degrees=0.5, length=0.05)
-
-
-def test_consensus_hypotheses_are_distinct_sorted_and_counted_right() -> None:
-    rng = np.random.default_rng(23)
-    source = room_points(rng, 600)
-    moved = np.concatenate(
-        [transform_points(random_motion(30 + k), part) for k, part in enumerate(np.split(source, 6))]
-    )
-    rows = np.hstack([source, moved])
-    for limit in (1, 2, 4, 15):
-        found = ConsensusEstimator(num_hypotheses=limit)(rows, inlier_threshold=THRESHOLD)
-        assert len(found) == limit or limit > 6
-        assert len(found) >= min(limit, 6)
-        scores = [h.score for h in found]
-        assert scores == sorted(scores, reverse=True)
-        for i, h in enumerate(found):
-            T = h.T_target_source
-            residuals = np.linalg.norm(transform_points(T, source) - moved, axis=1)
-            assert h.num_inliers == (residuals < THRESHOLD).sum()
-            assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-            for other in found[:i]:
-                shift = np.linalg.norm((T - other.T_target_source) @ [*source.mean(0), 1])
-                turn = rotation_error_deg(T, other.T_target_source)
-                # The last fit in float64 may bring two hypotheses nearer by a little.
-                assert turn > 14 or shift > 0.8 * 3 * THRESHOLD
-    assert {np.argmin([rotation_error_deg(h.T_target_source, random_motion(30 + k)) for k in range(6)])
-            for h in found[:6]} == set(range(6))  # fmt: skip
 
 
 def test_a_mirrored_scene_is_not_called_a_fit() -> None:
@@ -338,10 +162,6 @@ def test_consensus_and_svd_do_not_mind_coordinates_far_away() -> None:
 # ---- nothing to be found, nothing to be made up ------------------------------------------------------
 
 
-def line(count: int) -> np.ndarray:
-    return np.outer(np.linspace(0, 4, count), [1.0, 0.5, 0.2])
-
-
 @ALL
 @pytest.mark.parametrize(
     "source",
@@ -452,8 +272,7 @@ def test_configuration_reaches_the_estimator(name: str) -> None:
     assert made == expected[name]
 
 
-# ---- the same answer every time, in bounded memory ---------------------------------------------------
-
+# ---- the same answer every time ----------------------------------------------------------------------
 THREADS_SCRIPT = """
 import numpy as np
 from geomoe3d.estimators.consensus import ConsensusEstimator
@@ -519,120 +338,3 @@ def test_the_same_bytes_twice_whatever_was_drawn_before(estimator) -> None:
     second = estimator(rows, inlier_threshold=THRESHOLD, seed=7)
     assert [h.T_target_source.tobytes() for h in first] == [h.T_target_source.tobytes() for h in second]
     assert [(h.score, h.num_inliers) for h in first] == [(h.score, h.num_inliers) for h in second]
-
-
-def test_ransac_draws_by_its_seed() -> None:
-    rows, _, _ = problem(13, inliers=0.05, noise=0.02)
-    few = RansacEstimator(
-        iterations=3000
-    )  # too few among so many wrong rows: what is found depends on the draw
-    answers = {few(rows, inlier_threshold=THRESHOLD, seed=s)[0].T_target_source.tobytes() for s in range(4)}
-    assert len(answers) > 1
-
-
-def test_twelve_thousand_correspondences_stay_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No table of all pairs of all rows; the heaviest rows propose, all rows are scored."""
-    rows, T, true = problem(14, count=12_000, inliers=0.02, noise=0.005)
-    weights = np.where(true, 1.0, 0.5)
-    sizes = []
-    plain = consensus.distances
-    monkeypatch.setattr(consensus, "distances", lambda p, q: (sizes.append(len(q)), plain(p, q))[1])
-    tracemalloc.start()
-    found = ConsensusEstimator(max_dense=1000, num_seeds=100)(rows, weights, inlier_threshold=THRESHOLD)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert max(sizes) == 1000
-    assert peak < 150e6  # one float32 table of all pairs would take 576 MB
-    assert_motion(found[0].T_target_source, T, degrees=1, length=0.1)
-    residuals = np.linalg.norm(transform_points(found[0].T_target_source, rows[:, :3]) - rows[:, 3:], axis=1)
-    assert found[0].num_inliers == (residuals < THRESHOLD).sum() >= true.sum()
-
-
-def test_default_bound_of_all_pairs() -> None:
-    assert ConsensusEstimator().max_dense <= 5000  # 100 MB a table
-
-
-# ---- the steps of consensus, against their definitions -----------------------------------------------
-
-
-def test_distances_and_compatibility_equal_their_definitions() -> None:
-    rng = np.random.default_rng(80)
-    p, q = rng.normal(size=(2, 60, 3)).astype(np.float32) * 20
-    np.testing.assert_allclose(consensus.distances(p, p), cdist(p, p), atol=0.05)
-    q[:30] = p[:30]
-    expected = np.abs(cdist(p, p) - cdist(q, q))
-    apart, compatible = consensus.compatibility(p, q)
-    np.testing.assert_allclose(apart, cdist(p, p), atol=0.05)
-    sure = np.abs(expected - 1) > 1e-3
-    off_diagonal = ~np.eye(60, dtype=bool)
-    assert ((compatible == 1) == (expected < 1))[sure & off_diagonal].all()
-    assert (compatible[:30, :30] == ~np.eye(30, dtype=bool)).all()
-    assert set(np.unique(compatible)) == {0, 1}
-
-
-def test_bundles_share_their_vote() -> None:
-    target = np.array([[1.0, 2, 3], [1, 2, 3], [0, 0, 0], [1, 2, 3], [1, 2, 3], [5, 5, 5], [-0.0, 0, 0]])
-    expected = 1 / np.sqrt([4, 4, 2, 4, 4, 1, 2])
-    np.testing.assert_allclose(consensus.bundle_weights(target), expected, rtol=1e-6)
-
-
-def test_local_sets_are_the_best_by_second_order_compatibility() -> None:
-    rng = np.random.default_rng(81)
-    n, size = 40, 6
-    compatible = (rng.random((n, n)) < 0.4).astype(np.float32)
-    compatible = np.triu(compatible, 1) + np.triu(compatible, 1).T
-    vote = rng.uniform(0.1, 1, n).astype(np.float32)
-    seeds = np.array([3, 17, 39])
-    witnesses = np.arange(0, n, 2)
-    members, weights = consensus.local_sets(compatible, seeds, vote, size, witnesses)
-    assert members.shape == weights.shape == (3, size + 1)
-    for row, seed in enumerate(seeds):
-        S = [
-            compatible[seed, j]
-            * vote[j]
-            * sum(compatible[seed, k] * vote[k] * compatible[k, j] for k in witnesses)
-            for j in range(n)
-        ]
-        assert members[row, 0] == seed
-        assert list(members[row, 1:]) == list(np.argsort(S)[::-1][:size])
-        np.testing.assert_allclose(weights[row, 1:], np.sort(S)[::-1][:size], rtol=1e-4)
-        assert weights[row, 0] == pytest.approx(max(S), rel=1e-3)
-
-
-def test_seeds_are_the_best_supported_and_spread() -> None:
-    rng = np.random.default_rng(82)
-    points = rng.normal(size=(50, 3)).astype(np.float32) * 100
-    points[:10] = points[0] + 0.01 * rng.normal(size=(10, 3))  # one bundle with the largest supports
-    support = np.r_[np.linspace(50, 41, 10), np.linspace(40, 26, 40)].astype(np.float32)
-    seeds = consensus.choose_seeds(support, cdist(points, points).astype(np.float32), 30)
-    # 0 leads; all others of the bundle count half, less than any of the scattered ones. Three quarters of
-    # the seeds are the strongest in that order, the others lie evenly over the rest of it.
-    order = [0, *range(10, 50), *range(1, 10)]
-    assert list(seeds[:23]) == order[:23]
-    assert list(seeds[23:]) == [order[23 + k] for k in (0, 4, 8, 13, 17, 21, 26)]
-    assert list(consensus.choose_seeds(support, cdist(points, points), 50)) == list(range(50))
-
-
-def test_score_is_the_documented_sum() -> None:
-    rng = np.random.default_rng(83)
-    source, target = rng.normal(size=(2, 30, 3)).astype(np.float32)
-    vote = rng.random(30).astype(np.float32)
-    T = [random_motion(k, 0.3) for k in range(4)]
-    R, t = np.array([x[:3, :3] for x in T]), np.array([x[:3, 3] for x in T])
-    expected = [
-        (vote * np.exp(-((transform_points(x, source) - target) ** 2).sum(1) / (2 * 0.75**2))).sum()
-        for x in T
-    ]
-    np.testing.assert_allclose(consensus.score(R, t, source, target, vote), expected, rtol=1e-4)
-
-
-def test_refit_leaves_a_motion_with_two_inliers() -> None:
-    source = np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5]], dtype=np.float32)
-    target = source + np.array([[0.1, 0, 0], [0.1, 0, 0], [30, 0, 0], [0, 30, 0]])
-    R, t = np.eye(3, dtype=np.float32)[None], np.zeros((1, 3), dtype=np.float32)
-    R_new, t_new = consensus.refit(R, t, source, target.astype(np.float32), np.ones(4, dtype=np.float32))
-    np.testing.assert_array_equal(R_new, R)
-    np.testing.assert_array_equal(t_new, t)
-    target[2] = source[2] + [0.1, 0, 0]
-    _, t_new = consensus.refit(R, t, source, target.astype(np.float32), np.ones(4, dtype=np.float32))
-    np.testing.assert_allclose(t_new, [[0.1, 0, 0]], atol=1e-5)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
+    from command_line import FakeRegistrar
+
     from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 
 
@@ -30,3 +33,19 @@ def two_runs(
     from report_runs import make_pairs, make_two_runs
 
     return make_two_runs(make_pairs(tmp_path_factory.mktemp("clouds")))
+
+
+@pytest.fixture
+def fake_registrar(monkeypatch: pytest.MonkeyPatch) -> type[FakeRegistrar]:
+    """The registrar of every verb called in this test."""
+    from command_line import install_registrar
+
+    return install_registrar(monkeypatch)
+
+
+@pytest.fixture
+def scan_files(tmp_path: Path) -> list[str]:
+    """Two tiny files to name on the command line."""
+    from command_line import write_scans
+
+    return write_scans(tmp_path)

@@ -1,0 +1,90 @@
+"""The verbs and their help: names, versions, wrong words, and how soon it answers."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+from command_line import ROOT, call
+
+from geomoe3d import __version__
+from geomoe3d.cli.main import VERBS, register_main
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_help_of_every_verb(verb, option, capsys):
+    assert call(verb, option) == 0
+    assert f"Usage: geomoe3d {verb}" in capsys.readouterr().out
+
+
+def test_help_lists_every_verb_with_its_purpose(capsys):
+    assert call("--help") == 0
+    text = capsys.readouterr().out
+    for verb in VERBS:
+        assert re.search(rf"^  {verb} +[A-Z]", text, re.MULTILINE)
+
+
+def test_version(capsys):
+    assert call("--version") == 0
+    assert __version__ in capsys.readouterr().out
+
+
+def test_register_is_a_command_of_its_own(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["register", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        register_main()
+    assert stop.value.code == 0
+    alone = capsys.readouterr().out
+    assert call("register", "--help") == 0
+    assert capsys.readouterr().out.replace("geomoe3d register", "register") == alone
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["regster"], "register"),
+        (["register", "a", "b", "--voxelsize", "1"], "--voxel-size"),
+        (["register", "a", "b", "--set", "estimator.nmae=ransac"], "estimator.name"),
+        (["register", "a", "b", "--set", "voxel_sizes=1"], "voxel_size"),
+        (["register", "a", "b", "--estimator", "ransack"], "'ransac'"),
+        (["register", "a", "b", "--set", "seed"], "key=value"),
+        (["register", "a", "b", "--voxel-size", "0"], "greater than 0"),
+        (["register", "a", "b", "--voxel-size", "-1"], "greater than 0"),
+        (["register", "a", "b", "--voxel-size", "big"], "voxel_size"),
+        (["register", "a", "b", "--seed", "-1"], "seed"),
+        (["register", "a", "b", "--voxel-size", "inf"], "finite"),
+        (["register", "a", "b", "--config", "/there/is/none.yaml"], "/there/is/none.yaml"),
+        (["register", "a"], "TARGET"),
+        (["register", "a", "b", "c"], "c"),
+        (["qqqq"], "register"),
+    ],
+)
+def test_a_wrong_word_ends_with_2_and_the_right_one(arguments, hint, fake_registrar, capsys):
+    assert call(*arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert hint in printed.err
+    assert "Traceback" not in printed.err
+    assert fake_registrar.asked == []
+
+
+def test_help_answers_within_a_second_and_loads_no_library():
+    code = (
+        "import sys, time; start = time.perf_counter()\n"
+        "from geomoe3d.cli.main import geomoe3d; from geomoe3d.cli.errors import run\n"
+        "code = run(geomoe3d, 'geomoe3d', ['--help'])\n"
+        "heavy = {'numpy', 'open3d', 'torch', 'matplotlib', 'scipy', 'rich', 'pydantic'} & set(sys.modules)\n"
+        "print(code, sorted(heavy), time.perf_counter() - start)"
+    )
+    seconds = []
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        last = done.stdout.splitlines()[-1]
+        assert last.startswith("0 [] ")
+        seconds.append(float(last.split()[-1]))
+    assert min(seconds) < 1.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    import numpy as np
     from command_line import FakeRegistrar
 
     from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
@@ -49,3 +50,11 @@ def scan_files(tmp_path: Path) -> list[str]:
     from command_line import write_scans
 
     return write_scans(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def scanned_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    """A folder of small scans to be aligned with each other, and their true poses."""
+    from small_scans import write_room
+
+    return write_room(tmp_path_factory.mktemp("room"))

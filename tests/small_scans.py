@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -9,6 +11,9 @@ from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 
 SETTINGS = ["voxel_size=0.12", "preparation.viewpoint=centroid", "matching.max_correspondences=400"]
 """Configuration under which a pair takes some 0.1 s of one core."""
+UTM = np.array([583394.0, 5283100.0, 498.0])
+CUTS = ((0.0, 2.6), (0.5, 3.1), (1.0, 3.6), (1.4, 4.0), (1.8, 4.6))
+"""Five parts of a scene, low and high x of each: neighbours share most of what they show."""
 
 
 def scene(seed=0, *, count=12, size=4.0, density=150):
@@ -37,3 +42,15 @@ def cut(points, low, high, *, seed, keep=0.8):
     part = part[rng.random(len(part)) < keep]
     pose = make_transform(Rotation.random(random_state=seed).as_matrix(), rng.uniform(-3, 3, 3))
     return transform_points(inverse(pose), part), pose
+
+
+def write_room(folder: Path) -> tuple[Path, dict[str, np.ndarray]]:
+    """Five scans of one scene at map coordinates, one of another scene, one broken file; true poses."""
+    points, poses = scene(), {}
+    for number, (low, high) in enumerate(CUTS):
+        part, T = cut(points, low, high, seed=number)
+        np.save(folder / f"scan_{number}.npy", part + UTM)
+        poses[f"scan_{number}"] = T
+    np.save(folder / "scan_8.npy", cut(scene(77), 0.0, 3.0, seed=8)[0])
+    (folder / "scan_9.ply").write_text("ply\nnothing\n")
+    return folder, poses

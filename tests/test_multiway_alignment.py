@@ -1,0 +1,65 @@
+"""Surfaces draw their scans into place, and leave alone what overlaps nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pose_graphs import largest_error
+from scipy.spatial.transform import Rotation
+from small_scans import CUTS, SETTINGS, cut, scene
+
+from geomoe3d.clouds.prepare import prepare
+from geomoe3d.config import load_config
+from geomoe3d.geometry.se3 import inverse, make_transform
+from geomoe3d.multiway.alignment import Surface, align_scans
+from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.types import PointCloud
+
+CONFIG = load_config(None, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    """Six scans of one scene as surfaces, and one of another scene; true poses."""
+    points, truth, made = scene(3), {}, {}
+    for k, (low, high) in enumerate([*CUTS, (2.0, 4.4)]):
+        part, truth[k] = cut(points, low, high, seed=20 + k)
+        cloud = prepare(PointCloud(part), 0.12, CONFIG.preparation, viewpoint=None, seed=0)
+        made[k] = Surface(cloud.points, cloud.normals, signed=False)
+    elsewhere = prepare(PointCloud(scene(5) + 50), 0.12, CONFIG.preparation, viewpoint=None, seed=0)
+    made[6], truth[6] = Surface(elsewhere.points, elsewhere.normals, signed=False), np.eye(4)
+    return made, truth, Overlaps({k: s.points for k, s in made.items()})
+
+
+def moved_about(truth, rng, turn=0.02, shift=0.1):
+    poses = {}
+    for k, T in truth.items():
+        R = Rotation.from_rotvec(turn * rng.normal(size=3)).as_matrix()
+        poses[k] = T @ make_transform(R, shift * rng.normal(size=3))
+    return poses
+
+
+def test_surfaces_draw_scans_into_place(surfaces):
+    made, truth, overlaps = surfaces
+    start = moved_about({k: truth[k] for k in range(6)}, np.random.default_rng(1))
+    found = align_scans(start, made, overlaps, 0.12)
+    assert np.abs(found[0] - start[0]).max() < 1e-12
+    assert largest_error(start, truth) > 0.15
+    assert largest_error(found, truth) < 0.03
+    for T in found.values():
+        assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-12
+    # The frame of the group changes nothing: it may lie far away and be turned.
+    away = make_transform(Rotation.random(random_state=9).as_matrix(), np.array([300.0, -40.0, 7.0]))
+    far = align_scans({k: away @ T for k, T in start.items()}, made, overlaps, 0.12)
+    assert max(np.abs(inverse(away) @ far[k] - found[k]).max() for k in found) < 1e-6
+
+
+def test_a_scan_that_overlaps_nothing_stays_where_it_was(surfaces):
+    made, truth, overlaps = surfaces
+    start = {0: truth[0], 6: truth[6]}
+    found = align_scans(start, made, overlaps, 0.12)
+    assert all(np.abs(found[k] - start[k]).max() < 1e-12 for k in start)
+    one = align_scans({3: truth[3]}, made, overlaps, 0.12)
+    assert np.abs(one[3] - truth[3]).max() < 1e-12
+    among = align_scans(moved_about(truth, np.random.default_rng(2), 0.01, 0.05), made, overlaps, 0.12)
+    assert largest_error({k: among[k] for k in range(6)}, truth) < 0.03

@@ -1,0 +1,224 @@
+"""Many scans in one model: right poses, no wrong edge, files that agree, earlier pairs used again."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from small_scans import SETTINGS, UTM
+
+from geomoe3d import register_scans
+from geomoe3d.batch.store import JOURNAL_FILE
+from geomoe3d.clouds.io import load_points
+from geomoe3d.config import load_config
+from geomoe3d.errors import InputError
+from geomoe3d.geometry.se3 import inverse, make_transform, rotation_error_deg, transform_points
+from geomoe3d.journal import read_journal
+from geomoe3d.multiway.page import render_model_page
+
+CONFIG = load_config(None, SETTINGS)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A cache of described clouds of this file's own."""
+    kept = os.environ.get("GEOMOE3D_CACHE")
+    os.environ["GEOMOE3D_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    if kept is None:
+        del os.environ["GEOMOE3D_CACHE"]
+    else:
+        os.environ["GEOMOE3D_CACHE"] = kept
+
+
+@pytest.fixture(scope="module")
+def model(scanned_room, tmp_path_factory):
+    return register_scans([scanned_room[0]], tmp_path_factory.mktemp("model"), config=CONFIG)
+
+
+def test_every_scan_is_placed_rightly_or_named_with_a_reason(scanned_room, model):
+    _, truth = scanned_room
+    (group,) = model.groups
+    assert set(group.poses) == set(truth)
+    assert group.reference == "scan_0"
+    for name, T in group.poses.items():
+        expected = inverse(truth["scan_0"]) @ truth[name]
+        points = np.random.default_rng(0).uniform(-2, 2, (20, 3))
+        found = transform_points(T, points + UTM) - UTM
+        assert np.abs(found - transform_points(expected, points)).max() < 0.05, name
+    assert set(model.unplaced) == {"scan_8", "scan_9"}
+    assert "surest" in model.unplaced["scan_8"]
+    assert "scan_9.ply" in model.unplaced["scan_9"]
+    assert not model.ok
+    for edge in model.edges:
+        right = edge.source in truth and edge.target in truth
+        if right:
+            expected = inverse(truth[edge.target]) @ truth[edge.source]
+            right = rotation_error_deg(edge.T_target_source, expected) < 15
+        assert right or not edge.kept
+        assert edge.kept == (edge.reason == "")
+    assert sum(edge.kept for edge in model.edges) >= 4
+
+
+def test_everything_is_written_and_agrees(scanned_room, model):
+    folder = model.folder
+    stored = json.loads((folder / "poses.json").read_text())
+    (group,) = stored["groups"]
+    poses = model.groups[0].poses
+    for scan in group["scans"]:
+        assert np.array(scan["T_reference_scan"]).tobytes() == poses[scan["name"]].tobytes()
+        assert Path(scan["path"]).is_file()
+    kitti = np.loadtxt(folder / "group1.kitti.txt").reshape(-1, 3, 4)
+    assert kitti.tobytes() == np.stack([T[:3] for T in poses.values()]).tobytes()
+    tum = np.loadtxt(folder / "group1.tum.txt")
+    assert tum[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert tum[:, 1:4].tobytes() == np.ascontiguousarray(kitti[:, :, 3]).tobytes()
+    assert np.abs(Rotation.from_quat(tum[:, 4:]).as_matrix() - kitti[:, :, :3]).max() < 1e-12
+    merged = load_points(folder / "group1.ply")
+    assert np.abs(merged.file_points.mean(0) - UTM).max() < 20
+    assert np.abs(merged.file_points * 1e4 - np.round(merged.file_points * 1e4)).max() > 1e-3  # not float32
+    inputs = [transform_points(T, np.load(scanned_room[0] / f"{name}.npy")) for name, T in poses.items()]
+    everything = np.concatenate(inputs) - UTM
+    assert len(merged) < len(everything) / 3
+    reach = 0.12 * np.sqrt(3)
+    assert cKDTree(merged.file_points - UTM).query(everything)[0].max() < reach
+    assert cKDTree(everything).query(merged.file_points - UTM)[0].max() < reach
+
+
+def test_the_g2o_file_holds_the_graph(model):
+    lines = (model.folder / "group1.g2o").read_text().splitlines()
+    vertices = [line.split() for line in lines if line.startswith("VERTEX_SE3:QUAT")]
+    edges = [line.split() for line in lines if line.startswith("EDGE_SE3:QUAT")]
+    poses = {int(v[1]): pose_of(v[2:9]) for v in vertices}
+    assert sorted(poses) == [0, 1, 2, 3, 4]
+    assert lines.count("FIX 0") == 1
+    assert len(edges) == sum(edge.kept for edge in model.edges)
+    for words in edges:
+        i, j = int(words[1]), int(words[2])
+        predicted = inverse(poses[i]) @ poses[j]
+        assert np.abs(pose_of(words[3:10]) - predicted).max() < 0.1
+        information = np.zeros((6, 6))
+        information[np.triu_indices(6)] = [float(word) for word in words[10:]]
+        information += np.triu(information, 1).T
+        assert np.linalg.eigvalsh(information)[0] > 0
+
+
+def pose_of(words):
+    values = np.array([float(word) for word in words])
+    return make_transform(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
+
+
+def test_the_page_is_self_contained_and_lists_every_scan(model):
+    page = (model.folder / "page.html").read_text()
+    assert page == render_model_page(model)
+    for scan in model.scans:
+        assert scan.name in page
+    assert page.count("data-scan=") == 5
+    assert "src=" not in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert "{{" not in page
+    data = json.loads(page.split('type="application/json">', 1)[1].split("</script>", 1)[0])
+    assert len(data["clouds"]) == 5
+    assert data["lines"]["classes"][0]["drawn"] == sum(edge.kept for edge in model.edges)
+
+
+def test_adding_a_scan_reuses_every_earlier_pair(scanned_room, tmp_path):
+    folder, _ = scanned_room
+    files = [folder / f"scan_{k}.npy" for k in range(5)]
+    first = register_scans([files[0], files[1], files[3]], tmp_path, config=CONFIG, page=False)
+    before = (tmp_path / "pairs" / JOURNAL_FILE).read_bytes()
+    more = register_scans([files[3], files[0], files[1], files[2]], tmp_path, config=CONFIG, page=False)
+    after = (tmp_path / "pairs" / JOURNAL_FILE).read_bytes()
+    assert first.num_pairs == 3
+    assert more.num_pairs == 6
+    assert after.startswith(before)
+    ids = [record["id"] for record in read_journal(tmp_path / "pairs" / JOURNAL_FILE)]
+    assert len(ids) == len(set(ids)) == 6
+    assert len(more.groups[0].poses) == 4
+    again = register_scans([files[3], files[0], files[1], files[2]], tmp_path, config=CONFIG, page=False)
+    assert (tmp_path / "pairs" / JOURNAL_FILE).read_bytes() == after
+    assert again.to_json() == more.to_json()
+
+
+def test_the_command_places_and_exits_with_three(scanned_room, tmp_path):
+    folder, _ = scanned_room
+    options = [part for setting in SETTINGS for part in ("--set", setting)]
+    files = [str(folder / f"scan_{k}.npy") for k in (0, 1, 8)]
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "geomoe3d",
+            "multiway",
+            *files,
+            str(tmp_path / "o"),
+            *options,
+            "--workers",
+            "1",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        cwd=Path(__file__).parents[1],
+    )
+    assert done.returncode == 3, done.stderr
+    assert "2 of 3 scans placed" in done.stdout
+    assert "scan_8: its surest of 2 pairs" in done.stdout
+    assert "1 worker of about" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("inputs", "named", "message"),
+    [
+        (["none"], {}, "no file or folder"),
+        (["."], {}, "holds no clouds"),
+        (["a.npy"], {}, "at least 2 scans"),
+        (["a.npy", "a.npy"], {}, "more than once"),
+        (["a.npy", "b.npy"], {"pairs": "some"}, "choose auto, all or similar"),
+        (["a.npy", "b.npy"], {"neighbors": 0}, "at least 1"),
+        (["a.npy", "b.npy"], {}, "fewer than 2 scans can be used"),
+    ],
+)
+def test_unusable_input_is_refused(tmp_path, monkeypatch, inputs, named, message):
+    monkeypatch.chdir(tmp_path)
+    if inputs != ["."]:
+        for name in ("a", "b"):
+            (tmp_path / f"{name}.npy").write_bytes(b"broken")
+    with pytest.raises(InputError, match=message):
+        register_scans(inputs, tmp_path / "out", config=CONFIG, **named)
+
+
+def test_a_folder_that_holds_something_of_the_users_is_refused(scanned_room, tmp_path):
+    scans, _ = scanned_room
+    out = tmp_path / "out"
+    out.mkdir()
+    kept = [out / "group1.ply", out / "groups.csv"]
+    for path in kept:
+        path.write_text("mine")
+    with pytest.raises(InputError, match=r"group1\.ply' is not of a model"):
+        register_scans([scans], out, config=CONFIG)
+    with pytest.raises(InputError, match="is a file"):
+        register_scans([scans], kept[1], config=CONFIG)
+    with pytest.raises(InputError, match="taken for a scan"):
+        register_scans([scans], scans, config=CONFIG)
+    assert sorted(out.iterdir()) == kept
+    assert all(path.read_text() == "mine" for path in kept)
+
+
+def test_files_of_the_users_beside_a_model_stay(scanned_room, tmp_path):
+    scans = [scanned_room[0] / f"scan_{k}.npy" for k in (0, 1)]
+    (tmp_path / "grouping.txt").write_text("mine")
+    register_scans(scans, tmp_path, config=CONFIG, page=False)
+    (tmp_path / "group7.ply").write_bytes((tmp_path / "group1.ply").read_bytes())  # of a larger model before
+    register_scans(scans, tmp_path, config=CONFIG, page=False)
+    assert (tmp_path / "grouping.txt").read_text() == "mine"
+    assert (tmp_path / "group1.ply").is_file()
+    assert not (tmp_path / "group7.ply").exists()

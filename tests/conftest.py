@@ -58,3 +58,11 @@ def scanned_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[s
     from small_scans import write_room
 
     return write_room(tmp_path_factory.mktemp("room"))
+
+
+@pytest.fixture(scope="module")
+def posed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of posed scans with all its pairs."""
+    from posed_scans import write_posed
+
+    return write_posed(tmp_path_factory.mktemp("posed"))

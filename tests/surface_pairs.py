@@ -1,4 +1,4 @@
-"""Surfaces with a known shape, sampled twice: what refinement finds again and a judge has to hold."""
+"""Surfaces with a known shape, some sampled twice: to be prepared, refined and judged."""
 
 from __future__ import annotations
 
@@ -35,6 +35,13 @@ def surfaces(kind: str, seed: int = 0, count: int = 12_000) -> np.ndarray:
         points = points - 1.5
         points /= np.linalg.norm(points, axis=1, keepdims=True)
     return points
+
+
+def corner(rng: np.random.Generator, count: int = 4000, noise: float = 0.0) -> np.ndarray:
+    """Three faces of a 2 m cube that meet at (0, 0, 0)."""
+    points = rng.uniform(0, 2, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = 0
+    return points + noise * rng.normal(size=points.shape)
 
 
 def prepared(points: np.ndarray, voxel: float = VOXEL) -> PreparedCloud:

@@ -1,0 +1,44 @@
+"""Features of prepared points: of unit length, turned with nothing, zero for what has no neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from surface_pairs import corner
+
+from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.prepare import prepare
+from geomoe3d.config import PreparationConfig
+from geomoe3d.types import PointCloud
+
+CONFIG = PreparationConfig(viewpoint="centroid")  # a guess costs time and is tested by itself
+
+
+def test_features_are_unit_and_turn_with_nothing() -> None:
+    points = corner(np.random.default_rng(11), noise=0.003)
+    made = describe(prepare(PointCloud(points), 0.1, CONFIG), CONFIG)
+    assert made.features.shape == (len(made), 33)
+    assert made.features.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(made.features, axis=1), 1, atol=1e-4)
+    R = Rotation.random(random_state=11).as_matrix()
+    from dataclasses import replace
+
+    moved = replace(made, points=made.points @ R.T + [1, 2, 3], normals=made.normals @ R.T)
+    again = describe(moved, CONFIG)
+    distance = np.linalg.norm(again.features - made.features, axis=1)
+    assert np.median(distance) < 1e-3
+    assert (distance < 0.1).mean() > 0.98
+
+
+def test_a_point_without_neighbours_has_a_zero_feature() -> None:
+    from dataclasses import replace
+
+    made = prepare(PointCloud(corner(np.random.default_rng(12))), 0.1, CONFIG)
+    lonely = replace(
+        made,
+        points=np.vstack([made.points, [[90.0, 0, 0]]]),
+        normals=np.vstack([made.normals, [[0.0, 0, 1]]]),
+    )
+    features = describe(lonely, CONFIG).features
+    assert np.isfinite(features).all()
+    assert (features[-1] == 0).all()

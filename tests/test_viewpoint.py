@@ -1,0 +1,86 @@
+"""Where the sensors stood: believed near the origin only, guessed from what can be seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_pairs import corner
+
+from geomoe3d.clouds.prepare import orient_normals
+from geomoe3d.clouds.viewpoint import find_viewpoints, guess_viewpoint
+from geomoe3d.types import PointCloud
+
+
+def test_viewpoints_are_believed_near_the_origin_only_and_for_both_or_none() -> None:
+    points = corner(np.random.default_rng(21), 500)
+    near = PointCloud(points + 1.0, origin=np.array([0.0, 0, 0]))
+    shifted = PointCloud(points + 1.0 - 2.0, origin=np.array([2.0, 2, 2]))  # the same cloud in another frame
+    far = PointCloud(points, origin=np.array([583394.0, 5283100, 498]))
+    for rule in ("auto", "origin"):
+        a, b = find_viewpoints(near, shifted, rule)
+        np.testing.assert_array_equal(a, [0, 0, 0])
+        np.testing.assert_array_equal(b, [-2, -2, -2])  # the file's origin in local coordinates
+    assert find_viewpoints(near, far, "auto") == (None, None)
+    assert find_viewpoints(far, near, "auto") == (None, None)
+    for rule in ("centroid", "guess"):
+        assert find_viewpoints(near, near, rule) == (None, None)
+    np.testing.assert_array_equal(find_viewpoints(near, far, "origin")[1], -far.origin)
+
+
+@pytest.mark.parametrize(("distance", "believed"), [(0.0, True), (3.4, True), (3.5, False)])
+def test_one_extent_is_the_limit(distance: float, believed: bool) -> None:
+    """The extent of the unit faces is their diagonal, 2 sqrt(3) = 3.46."""
+    corners = np.array([[x, y, z] for x in (0.0, 2) for y in (0, 2) for z in (0, 2)])
+    for sign in (1, -1):
+        cloud = PointCloud((corners + distance * np.eye(3)[0]) * sign)
+        assert (find_viewpoints(cloud, cloud, "auto")[0] is not None) == believed
+
+
+def seen_from(viewpoint: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """What a sensor sees of a room with a box in it: points and exact normals turned to the sensor."""
+    points, normals = [], []
+    for low, high in (((0, 0, 0), (5, 4, 2.5)), ((2, 1, 0), (3, 2, 1.2))):
+        low, high = np.array(low, float), np.array(high, float)
+        for axis in range(3):
+            for side in (low, high):
+                count = round(60 * np.prod(np.delete(high - low, axis)))  # even over all surfaces
+                face = rng.uniform(low, high, (count, 3))
+                face[:, axis] = side[axis]
+                points.append(face)
+                normals.append(np.tile(np.eye(3)[axis], (count, 1)))
+    points, normals = np.vstack(points), np.vstack(normals)
+    rays = points - viewpoint
+    with np.errstate(divide="ignore"):
+        entry, leave = (np.array([c]) - viewpoint for c in ([2.0, 1, 0], [3.0, 2, 1.2]))
+        a, b = entry / rays, leave / rays
+    first, last = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+    hidden = (first < last) & (first < 1 - 1e-6) & (last > 0)
+    forward = rays @ np.array([1.0, 0.6, -0.3]) > 0.5 * np.linalg.norm(rays, axis=1)  # a field of view
+    seen = ~hidden & forward
+    return points[seen], orient_normals(points, normals, viewpoint)[seen]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_guessed_viewpoint_turns_nearly_all_normals_right(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, normals = seen_from(np.array([0.5, 0.5, 1.6]), rng)
+    signs = rng.choice([-1.0, 1.0], (len(normals), 1))
+    place = guess_viewpoint(points, normals * signs, 0.2)
+    turned = orient_normals(points, normals * signs, place)
+    assert (np.einsum("ij,ij->i", turned, normals) > 0).mean() > 0.9
+
+
+def test_a_guess_is_seeded_and_follows_the_cloud() -> None:
+    points, normals = seen_from(np.array([0.5, 0.5, 1.6]), np.random.default_rng(9))
+    place = guess_viewpoint(points, normals, 0.25)
+    np.testing.assert_array_equal(guess_viewpoint(points, normals, 0.25), place)
+    np.testing.assert_array_equal(guess_viewpoint(points, -normals, 0.25), place)
+    np.testing.assert_array_equal(guess_viewpoint(points * 1024, normals, 256), place * 1024)
+    assert (guess_viewpoint(points, normals, 0.25, seed=1) != place).any()
+
+
+def test_a_guess_for_points_on_a_line_or_in_a_plane_is_finite() -> None:
+    rng = np.random.default_rng(10)
+    for directions in (1, 2):
+        points = rng.normal(size=(50, directions)) @ np.eye(3)[:directions]
+        assert np.isfinite(guess_viewpoint(points, np.tile([0.0, 0, 1], (50, 1)), 0.1)).all()

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.config import FilterConfig
 from geomoe3d.errors import ConfigError
-from geomoe3d.filters.base import FilterOutput, NoFilter, filter_names, make_filter
+from geomoe3d.filters.base import FilterOutput, NoFilter, filter_names, make_filter, resolve_filter
 from geomoe3d.filters.spectral import SpectralFilter
 from geomoe3d.types import Correspondences
 
@@ -60,6 +61,17 @@ def test_names_are_those_that_can_be_made_and_others_name_the_nearest() -> None:
         make_filter("spectrl")
     with pytest.raises(ConfigError, match=r"known: .*none.*spectral"):
         make_filter("zzzzzz")
+
+
+def test_auto_takes_the_network_where_it_can_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert resolve_filter(FilterConfig()).name == "geomoe"
+    assert resolve_filter(FilterConfig(name="spectral")).name == "spectral"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert resolve_filter(FilterConfig()).name == "none"
+    assert resolve_filter(FilterConfig(weights="mine.safetensors")).name == "geomoe"  # and says what lacks
+    monkeypatch.undo()
+    monkeypatch.setattr("geomoe3d.filters.base.packaged_names", list)
+    assert resolve_filter(FilterConfig()).name == "none"
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -18,6 +18,7 @@ from geomoe3d.training.losses import (
     network_motion,
     regression_loss,
     total_loss,
+    verdict_loss,
     virtual_lattice,
 )
 
@@ -189,3 +190,17 @@ def test_plain_classification_weighs_rows_and_puts_its_zero_where_the_weight_say
     classification_loss(z, labels, None, "plain", 3.0).sum().backward()
     assert z.grad is not None
     assert float(z.grad.sum()) == pytest.approx(0, abs=1e-6)
+
+
+def test_verdict_loss_against_a_case_by_hand() -> None:
+    verdict = torch.tensor([2.0, 0.0, 1.0, -1.0, 3.0])
+    right = torch.tensor([True, False, False, False, True])
+    pair = torch.tensor([0, 0, 0, 1, 2])  # the second pair has no right motion, the third no wrong one
+    preference = -np.log(np.exp(2) / (np.exp(2) + 1 + np.exp(1)))
+    doubt = np.mean([np.log1p(np.exp(-2)), np.log(2), np.log1p(np.exp(1)), np.log1p(np.exp(-1)),
+                     np.log1p(np.exp(-3))])  # fmt: skip
+    assert float(verdict_loss(verdict, right, pair)) == pytest.approx(preference + doubt, abs=1e-6)
+    v = verdict.clone().requires_grad_()
+    verdict_loss(v, torch.zeros(5, dtype=torch.bool), pair).backward()
+    assert v.grad is not None
+    assert torch.isfinite(v.grad).all()

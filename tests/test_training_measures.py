@@ -9,7 +9,7 @@ import torch
 from training_runs import config_of
 
 from geomoe3d.training.batches import make_sample
-from geomoe3d.training.measures import evaluate, label_measures, motion_found
+from geomoe3d.training.measures import best_of_pair, evaluate, label_measures, motion_found
 from geomoe3d.training.synthetic import SyntheticConfig, SyntheticPairs
 from geomoe3d.training.trainer import TrainingRun
 
@@ -58,3 +58,8 @@ def test_evaluation_leaves_the_model_in_training_mode(tmp_path: Path) -> None:
     assert together == pytest.approx(alone, abs=1e-6)
     assert run.model.training
     assert all(torch.equal(v, before[k]) for k, v in run.model.state_dict().items())
+
+
+def test_the_best_of_each_pair() -> None:
+    best = best_of_pair(torch.tensor([0.0, 5.0, 1.0, 7.0, 7.0]), torch.tensor([0, 0, 1, 1, 1]))
+    assert best.tolist() == [1, 3]

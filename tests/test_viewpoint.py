@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from corner_scenes import scene
 from surface_pairs import corner
 
 from geomoe3d.clouds.prepare import orient_normals
-from geomoe3d.clouds.viewpoint import find_viewpoints, guess_viewpoint
+from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints, guess_viewpoint
 from geomoe3d.types import PointCloud
 
 
@@ -34,6 +35,15 @@ def test_one_extent_is_the_limit(distance: float, believed: bool) -> None:
     for sign in (1, -1):
         cloud = PointCloud((corners + distance * np.eye(3)[0]) * sign)
         assert (find_viewpoints(cloud, cloud, "auto")[0] is not None) == believed
+
+
+def test_bare_correspondences_have_their_sensors_at_the_origins_that_are_near() -> None:
+    rows, _ = scene()
+    zero = np.zeros(3)
+    found = believed_viewpoints(rows, (zero, zero))
+    assert found is not None
+    np.testing.assert_array_equal(found, np.zeros((2, 3)))
+    assert believed_viewpoints(rows, (zero, np.array([3e5, 0, 0]))) is None
 
 
 def seen_from(viewpoint: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

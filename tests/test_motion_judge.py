@@ -1,0 +1,162 @@
+"""A network that judges motions as a filter: the same verdict folded, padded and on any number of threads."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+from corner_scenes import AT_ZERO, VOXEL, scene
+from judged_motions import network, turned
+
+from geomoe3d.config import build_config
+from geomoe3d.errors import CheckpointError
+from geomoe3d.filters.architecture import NetworkConfig
+from geomoe3d.filters.folded import FoldedGeoMoE
+from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.filters.geomoe_filter import GeoMoEFilter
+from geomoe3d.filters.inputs import MotionInputs, collate
+from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
+from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.types import Correspondences
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.mark.parametrize("changes", [{}, {"prior": "none"}, {"feed_forward": "dense"}])
+def test_folded_network_gives_the_same_verdict(changes: dict[str, object]) -> None:
+    model = network(**changes)
+    rows, T = scene(1)
+    nowhere = make_transform(np.eye(3), np.full(3, 100.0))  # brings nothing together: all rejected at first
+    inputs = MotionInputs(rows, AT_ZERO, VOXEL, model.config).under(np.stack([T, np.eye(4), nowhere]))
+    batch = collate(inputs)
+    with torch.no_grad():
+        plain = model(batch.coordinates, batch.channels, batch.neighbors)
+    assert plain.verdict is not None
+    folded = FoldedGeoMoE(model)
+    for k, one in enumerate(inputs):
+        found = folded(one.coordinates, one.channels, one.neighbors)
+        assert found.verdict is not None
+        torch.testing.assert_close(found.verdict, plain.verdict[k], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(found.logits, plain.logits[:, k], atol=1e-4, rtol=1e-4)
+    channels = batch.channels
+    several = folded.under_motions(inputs[0].coordinates, channels, inputs[0].neighbors, insight=True)
+    for k, found in enumerate(several):
+        alone = folded(inputs[k].coordinates, inputs[k].channels, inputs[k].neighbors, insight=True)
+        torch.testing.assert_close(found.verdict, alone.verdict, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(found.logits, alone.logits, atol=1e-4, rtol=1e-4)
+        assert found.sub_field is not None
+        assert alone.sub_field is not None
+        assert (found.sub_field == alone.sub_field).float().mean() > 0.99
+
+
+def test_padding_changes_no_verdict() -> None:
+    model = network()
+    short, long = scene(1, 200), scene(2, 300)
+    inputs = [MotionInputs(rows, AT_ZERO, VOXEL, model.config).under(T[None])[0] for rows, T in (short, long)]
+    both, alone = collate(inputs), collate(inputs[:1])
+    assert both.mask is not None
+    with torch.no_grad():
+        padded = model(both.coordinates, both.channels, both.neighbors, both.mask).verdict
+        plain = model(alone.coordinates, alone.channels, alone.neighbors).verdict
+    torch.testing.assert_close(padded[:1], plain, atol=1e-4, rtol=1e-4)
+
+
+def test_filter_judges_what_consensus_proposes() -> None:
+    rows, _ = scene(4)
+    found = MotionJudge(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
+    assert found.hypotheses
+    verdicts = [h.verdict for h in found.hypotheses if h.verdict is not None]
+    assert verdicts == sorted(verdicts, reverse=True)
+    assert found.weights.shape == (len(rows),)
+    assert found.logits is not None
+    again = MotionJudge(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
+    np.testing.assert_array_equal(again.weights, found.weights)
+
+
+def test_each_network_has_its_own_filter() -> None:
+    with pytest.raises(CheckpointError, match="MotionJudge"):
+        GeoMoEFilter(network())
+    with pytest.raises(CheckpointError, match="GeoMoEFilter"):
+        MotionJudge(GeoMoE(build_config(NetworkConfig, {"num_layers": 1, "width": 8, "num_heads": 2})))
+
+
+def test_mutual_rows_come_first() -> None:
+    rows, _ = scene(4)
+    mutual = np.arange(len(rows)) % 3 == 0
+    few = likeliest_rows(Correspondences(rows, mutual=mutual), 120, 0)
+    assert few.mutual is not None
+    assert len(few) == 120
+    assert few.mutual.sum() == mutual.sum()
+    assert likeliest_rows(few, 120, 0) is few
+
+
+def test_more_rows_than_are_judged_are_all_weighed_wherever_they_stand() -> None:
+    rows, _ = scene(4, count=1500)
+    rows = rows[np.argsort(rows[:, 0])]
+    rows[:3] = np.nan
+    few = likeliest_rows(Correspondences(rows), 1000, 0)
+    assert np.nanmax(few.source[:, 0]) > 0.9 * np.nanmax(rows[:, 0])  # spread, not the first thousand
+    rows = np.vstack([np.full((1000, 6), np.nan), rows])
+    found = MotionJudge(network())(Correspondences(rows), voxel_size=VOXEL)
+    assert found.hypotheses
+    assert found.weights.shape == (2500,)
+    assert not found.weights[:1003].any()
+    assert found.logits is not None
+    assert np.isfinite(found.logits[1003:]).all()
+
+
+def test_a_judge_stops_where_it_has_seen_enough() -> None:
+    rows, T = scene(3)
+    motions = np.stack([T @ turned(k) for k in (0, 90, 180, 30, 60)])
+    judge = MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)
+    every = [j.verdict for j in judge(motions)]
+    assert len(every) == 5
+    assert [j.verdict for j in judge(motions, max(every) + 1)] == pytest.approx(every, abs=1e-4)
+    assert [j.verdict for j in judge(motions, min(every) - 1)] == pytest.approx(every[:2], abs=1e-4)
+
+
+def test_verdicts_are_the_same_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, T = scene(3)
+    motions = np.stack([T @ turned(k) for k in range(0, 180, 25)])
+    found = []
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        found.append(
+            [
+                j.verdict
+                for j in MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)(motions)
+            ]
+        )
+    assert found[0] == found[1] == found[2]
+
+
+def test_judging_leaves_the_threads_of_torch_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    torch.set_num_threads(2)
+    rows, T = scene(3)
+    judge = MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)
+    for _ in range(10):
+        judge(np.stack([T @ turned(k) for k in range(0, 180, 40)]))
+        seen: list[int] = []
+        fresh = threading.Thread(target=lambda seen=seen: seen.append(torch.get_num_threads()))
+        fresh.start()
+        fresh.join()
+        assert (torch.get_num_threads(), seen) == (2, [2])
+
+
+def test_filter_without_any_motion_gives_no_weight() -> None:
+    line = np.linspace(0, 1, 30)[:, None] * np.ones(6)
+    found = MotionJudge(network())(Correspondences(line), voxel_size=VOXEL)
+    assert found.hypotheses == ()
+    assert not found.weights.any()
+    assert not MotionJudge(network())(Correspondences(np.zeros((0, 6))), voxel_size=VOXEL).weights.any()
+
+
+def test_rows_that_are_not_finite_weigh_nothing() -> None:
+    rows, _ = scene(4)
+    rows[5, 2] = np.nan
+    found = MotionJudge(network())(Correspondences(rows), voxel_size=VOXEL)
+    assert found.hypotheses
+    assert found.weights[5] == 0

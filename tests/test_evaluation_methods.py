@@ -1,4 +1,4 @@
-"""Methods by name: ours and a user's function on pairs with a known motion; identities and refusals."""
+"""Methods by name: ours on pairs with a known motion; identities and refusals."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from method_pairs import MOTION, correspondences, lands, pair_of
 
 import geomoe3d
 from geomoe3d.data.sample import make_sample_pair
@@ -16,61 +16,15 @@ from geomoe3d.errors import CheckpointError, ConfigError, GeoMoE3DError, InputEr
 from geomoe3d.evaluation import methods
 from geomoe3d.evaluation.methods import OURS, hash_sources, make_method, method_names
 from geomoe3d.evaluation.records import MethodInput
-from geomoe3d.geometry.se3 import (
-    make_transform,
-    rotation_error_deg,
-    transform_points,
-    translation_error,
-)
+from geomoe3d.geometry.se3 import rotation_error_deg, transform_points, translation_error
 
-MOTION = make_transform(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([1.5, -0.5, 2.0]))
 UTM = np.array([583394.0, 5283100.0, 498.0])
-HORN = """
-import numpy as np
-
-def register(source, target):
-    a, b = source - source.mean(0), target - target.mean(0)
-    U, _, Vt = np.linalg.svd(a.T @ b)
-    R = Vt.T @ np.diag([1, 1, np.linalg.det(Vt.T @ U.T)]) @ U.T
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, target.mean(0) - R @ source.mean(0)
-    source += 1e6   # a careless function must not spoil what the next method is given
-    return T
-
-MOTION = 7
-"""
-
-
-def correspondences(share: float = 0.6, seed: int = 0, count: int = 300) -> np.ndarray:
-    """Rows (count, 6) in a room, a share of which agree with MOTION up to 1 cm."""
-    rng = np.random.default_rng(seed)
-    source = rng.uniform(-2, 2, (count, 3))
-    target = transform_points(MOTION, source) + rng.normal(0, 0.01, (count, 3))
-    wrong = rng.permutation(count)[: round((1 - share) * count)]
-    target[wrong] = rng.uniform(-3, 3, (len(wrong), 3)) + MOTION[:3, 3]
-    return np.hstack([source, target])
-
-
-def pair_of(rows: np.ndarray, seed: int = 0) -> MethodInput:
-    return MethodInput("room/0-1", correspondences=rows, seed=seed)
-
-
-def lands(
-    T: np.ndarray | None, truth: np.ndarray = MOTION, degrees: float = 1.0, metres: float = 0.05
-) -> bool:
-    return T is not None and (rotation_error_deg(T, truth) < degrees and translation_error(T, truth) < metres)
 
 
 @pytest.fixture(scope="module")
 def room():
     source, target, T = make_sample_pair(seed=0)
     return source.file_points, target.file_points, T
-
-
-def write(folder: Path, text: str, name: str = "mine.py") -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 # ---- ours on correspondences ------------------------------------------------------------------------
@@ -333,117 +287,5 @@ def test_source_hash_follows_what_decides_and_nothing_else(tmp_path):
         after = hash_sources(copy)
         assert after != before
         before = after
-    write(copy, "", "a_new_stage.py")
+    (copy / "a_new_stage.py").write_text("", encoding="utf-8")
     assert hash_sources(copy) != before
-
-
-# ---- a user's function ------------------------------------------------------------------------------
-
-
-def test_function_of_a_file_lands_and_cannot_spoil_its_input(tmp_path):
-    method = make_method(f"{write(tmp_path, HORN)}:register")
-    rows = correspondences(1.0)
-    kept = rows.copy()
-    assert lands(method(pair_of(rows)).T_target_source)
-    assert np.array_equal(rows, kept)
-    assert method.absent() is None
-    assert method.inputs == {"clouds", "correspondences"}
-
-
-def test_example_of_the_documentation_runs(tmp_path):
-    from geomoe3d.evaluation import adapter
-
-    lines = adapter.__doc__.split("::\n", 1)[1].split("\nOn the", 1)[0]
-    path = write(tmp_path, "\n".join(line[4:] for line in lines.splitlines()))
-    assert lands(make_method(f"{path}:register")(pair_of(correspondences(1.0))).T_target_source)
-
-
-def test_function_on_clouds_gets_two_sizes(tmp_path):
-    path = write(tmp_path, "def sizes(a, b):\n    raise ValueError(f'{a.shape} {b.shape}')\n")
-    given = MethodInput("x/0-1", source=np.zeros((5, 3)), target=np.ones((7, 3)))
-    with pytest.raises(GeoMoE3DError, match=r"x/0-1.*ValueError: \(5, 3\) \(7, 3\) \(mine.py, line 2\)"):
-        make_method(f"{path}:sizes")(given)
-
-
-def test_function_gets_the_keywords_it_names(tmp_path):
-    text = (
-        "def f(a, b, *, seed, inlier_threshold, other=1):\n"
-        "    raise RuntimeError(f'{seed} {inlier_threshold} {other}')\n"
-    )
-    with pytest.raises(InputError, match=r"RuntimeError: 9 0\.1 1"):
-        make_method(f"{write(tmp_path, text)}:f")(pair_of(correspondences(), seed=9))
-
-
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("return np.eye(3)", r"ndarray of shape \(3, 3\)"),
-        ("return 'right'", "returned str"),
-        ("return (np.eye(3), np.zeros(3))", "returned tuple"),
-        ("return 2 * np.eye(4)", "no rigid motion|last row"),
-        ("return np.diag([1.1, 1.1, 1.1, 1])", "no rigid motion"),
-        ("return np.diag([1, 1, -1, 1])", "mirrors"),
-        ("return np.diag([1, 1, 1, 2])", "last row"),
-        ("return 1 / 0", "ZeroDivisionError"),
-        ("import sys; sys.exit(3)", "SystemExit"),
-    ],
-)
-def test_nonsense_is_an_error_of_its_pair(tmp_path, body, message):
-    path = write(tmp_path, f"import numpy as np\ndef f(a, b):\n    {body}\n")
-    with pytest.raises(GeoMoE3DError, match=message) as caught:
-        make_method(f"{path}:f")(pair_of(correspondences()))
-    assert "room/0-1" in str(caught.value)
-
-
-@pytest.mark.parametrize("value", ["None", "np.full((4, 4), np.nan)", "np.full((4, 4), np.inf)"])
-def test_functions_may_give_up(tmp_path, value):
-    path = write(tmp_path, f"import numpy as np\ndef f(a, b):\n    return {value}\n")
-    assert make_method(f"{path}:f")(pair_of(correspondences())).T_target_source is None
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        ("registr", "did you mean 'register'"),
-        ("MOTION", "not a function"),
-        ("", "names no function"),
-    ],
-)
-def test_functions_that_are_not_there(tmp_path, function, message):
-    with pytest.raises(InputError, match=message):
-        make_method(f"{write(tmp_path, HORN)}:{function}")
-
-
-def test_files_and_modules_that_are_not_there(tmp_path):
-    with pytest.raises(InputError, match="no file"):
-        make_method(f"{tmp_path}/none.py:f")
-    with pytest.raises(InputError, match="no_such_package"):
-        make_method("no_such_package.module:f")
-    broken = write(tmp_path, "import a_library_that_is_not_there\n", "broken.py")
-    with pytest.raises(InputError, match="a_library_that_is_not_there"):
-        make_method(f"{broken}:f")
-    assert lands(
-        make_method(f"{write(tmp_path, HORN)}:register")(pair_of(correspondences(1.0))).T_target_source
-    )
-
-
-def test_function_of_a_package(tmp_path, monkeypatch):
-    write(tmp_path, HORN, "some_package_of_mine.py")
-    monkeypatch.syspath_prepend(tmp_path)
-    method = make_method("some_package_of_mine:register")
-    assert lands(method(pair_of(correspondences(1.0))).T_target_source)
-    assert len(method.identity()["source_sha256"]) == 64
-
-
-def test_a_file_finds_its_neighbours(tmp_path):
-    write(tmp_path, "VALUE = None\n", "neighbour_of_a_method.py")
-    text = "def f(a, b):\n    import neighbour_of_a_method\n    return neighbour_of_a_method.VALUE\n"
-    assert make_method(f"{write(tmp_path, text)}:f")(pair_of(correspondences())).T_target_source is None
-
-
-def test_identity_of_a_function_follows_its_file(tmp_path):
-    spec = f"{write(tmp_path, HORN)}:register"
-    first = make_method(spec).identity()
-    assert make_method(spec).identity() == first
-    write(tmp_path, HORN + "\n")
-    assert make_method(spec).identity() != first

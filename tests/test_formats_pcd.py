@@ -1,0 +1,94 @@
+"""PCD files: of Open3D and in the style of PCL; headers that lie, files cut short."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cloud_files import UTM, cloud, fails, pcd, small_cloud, unit_vectors
+
+from geomoe3d.clouds.io import load_points
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "options", [{"write_ascii": True}, {}, {"compressed": True}], ids=["ascii", "binary", "lzf"]
+)
+def test_pcd_of_open3d(tmp_path: Path, kind: type, options: dict[str, bool]) -> None:
+    o3d = pytest.importorskip("open3d")
+    points = cloud(center=UTM if kind is np.float64 else 0.0).astype(kind)
+    colors = np.random.default_rng(0).integers(0, 256, (200, 3)).astype(np.uint8)
+    tensor = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
+    tensor.point.colors = o3d.core.Tensor(colors)
+    tensor.point.normals = o3d.core.Tensor(unit_vectors(200).astype(kind))
+    o3d.t.io.write_point_cloud(str(tmp_path / "a.pcd"), tensor, **options)
+    loaded = load_points(tmp_path / "a.pcd")
+    atol = 1e-3 if options.get("write_ascii") else 0.0  # Open3D prints 10 significant digits
+    np.testing.assert_allclose(loaded.file_points, points, rtol=0, atol=atol)
+    np.testing.assert_allclose(loaded.normals, unit_vectors(200), atol=1e-6)
+    np.testing.assert_allclose(loaded.colors, colors / 255)
+
+
+def test_pcd_in_the_style_of_pcl(tmp_path: Path) -> None:
+    """Padding, a field of several numbers, colours in the bits of a float, no COUNT for plain fields."""
+    points = cloud().astype(np.float32)
+    rows = np.zeros(200, dtype=[("p", "<f4", 3), ("pad", "u1", 4), ("hist", "<f4", 5), ("rgb", "<u4")])
+    rows["p"], rows["rgb"] = points, 0x0A141E
+    header = "# .PCD v.7\nVERSION .7\nFIELDS x y z _ hist rgb\nSIZE 4 4 4 1 4 4\nTYPE F F F U F F\n"
+    header += "COUNT 1 1 1 4 5 1\n"
+    header += "WIDTH 20\nHEIGHT 10\nVIEWPOINT 1 2 3 1 0 0 0\nPOINTS 200\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(header.encode() + rows.tobytes())
+    loaded = load_points(tmp_path / "a.pcd")
+    assert np.array_equal(loaded.points, points)
+    np.testing.assert_allclose(loaded.colors, np.tile([10 / 255, 20 / 255, 30 / 255], (200, 1)))
+    bits = np.array([0x0A141E], np.uint32).view(np.float32)[0]
+    text = header.split("WIDTH")[0].replace(" _ hist", "").replace("4 4 4 1 4 4", "4 4 4 4")
+    text = text.replace("F F F U F F", "F F F F").replace("COUNT 1 1 1 4 5 1\n", "")
+    (tmp_path / "b.pcd").write_text(f"{text}WIDTH 1\nHEIGHT 1\nDATA ascii\n1 2 3 {bits:.9g}\n")
+    np.testing.assert_allclose(load_points(tmp_path / "b.pcd").colors, [[10 / 255, 20 / 255, 30 / 255]])
+
+
+# --- truncated files and lying headers -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
+@pytest.mark.parametrize(("said", "held"), [(150, 100), (60, 100)])
+def test_pcd_count_that_is_not_there(tmp_path: Path, data: str, said: int, held: int) -> None:
+    (tmp_path / "a.pcd").write_bytes(pcd(held, held, data))
+    assert np.array_equal(load_points(tmp_path / "a.pcd").points, small_cloud(held)) or data == "ascii"
+    (tmp_path / "a.pcd").write_bytes(pcd(said, held, data))
+    fails(tmp_path / "a.pcd", f"says {said} points", f"holds {held};")
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
+def test_truncated_pcd(tmp_path: Path, data: str) -> None:
+    (tmp_path / "a.pcd").write_bytes(pcd(100, 100, data)[:-700])
+    message = fails(tmp_path / "a.pcd", "holds")
+    assert data == "binary_compressed" or "says 100 points" in message
+
+
+def test_damaged_pcd_is_quiet(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = bytearray(pcd(100, 100, "binary_compressed"))
+    whole[-2000:] = b"\xff" * 2000
+    (tmp_path / "a.pcd").write_bytes(whole)
+    fails(tmp_path / "a.pcd", "0 of 100 points")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("FIELDS x y z", "FIELDS a y z", "only: a y z"),
+        ("FIELDS x y z", "", "lacks FIELDS"),
+        ("SIZE 8 8 8", "SIZE 8 8", "must agree"),
+        ("SIZE 8 8 8", "SIZE 8 8 3", "F3"),
+        ("DATA ascii", "DATA zip", "'zip'"),
+        ("WIDTH 5", "WIDTH 4", "WIDTH x HEIGHT is 4"),
+        ("COUNT 1 1 1", "COUNT 1 1 2", "COUNT 1"),
+        ("POINTS 5", "POINTS x", "'x'"),
+    ],
+)
+def test_malformed_pcd_headers(tmp_path: Path, old: str, new: str, word: str) -> None:
+    (tmp_path / "a.pcd").write_bytes(pcd(5, 5, "ascii").replace(old.encode(), new.encode(), 1))
+    fails(tmp_path / "a.pcd", word)

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 
     from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 
+# What these assert for several files explains itself as in a test.
+pytest.register_assert_rewrite(
+    "cloud_files", "estimator_problems", "headless_browser", "report_runs", "training_runs"
+)
+
 
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences
+from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.filters.base import FilterOutput
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis
@@ -53,6 +54,9 @@ def propose(
     found = of(np.ones(len(matched), dtype=np.bool_))
     if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
         found += of(matched.mutual)
+    if around is not None and found:
+        few, others = found[: config.num_aligned], found[config.num_aligned :]
+        found = KeypointAligner(matched.points, inlier_threshold).hypotheses(few) + others
     return found
 
 

@@ -81,7 +81,10 @@ class EstimatorConfig(Section):
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
     num_hypotheses: int = Field(20, ge=1, description="distinct hypotheses that consensus keeps by round")
     num_aligned: int = Field(
-        6, ge=0, description="so many of them are drawn closer by the keypoints of both scans, best first"
+        6,
+        ge=0,
+        description="so many of them, best first, are drawn closer by the keypoints of both scans; "
+        "correspondences without clouds only, since clouds do it better",
     )
     one_way_weight: float = Field(
         0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from corner_scenes import AT_ZERO, VOXEL, scene
 from judged_motions import network, turned
 
-from geomoe3d.config import build_config
+from geomoe3d.config import EstimatorConfig, build_config
 from geomoe3d.errors import CheckpointError
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.folded import FoldedGeoMoE
@@ -107,14 +108,32 @@ def test_more_rows_than_are_judged_are_all_weighed_wherever_they_stand() -> None
     assert np.isfinite(found.logits[1003:]).all()
 
 
-def test_a_judge_stops_where_it_has_seen_enough() -> None:
-    rows, T = scene(3)
-    motions = np.stack([T @ turned(k) for k in (0, 90, 180, 30, 60)])
-    judge = MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)
-    every = [j.verdict for j in judge(motions)]
-    assert len(every) == 5
-    assert [j.verdict for j in judge(motions, max(every) + 1)] == pytest.approx(every, abs=1e-4)
-    assert [j.verdict for j in judge(motions, min(every) - 1)] == pytest.approx(every[:2], abs=1e-4)
+@pytest.mark.parametrize(("convinced", "looked_at"), [(-100.0, 2), (100.0, 6)])
+def test_a_filter_stops_where_it_has_seen_enough(
+    convinced: float, looked_at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("geomoe3d.filters.motion_judge.CONVINCED", convinced)
+    found = MotionJudge(network())(Correspondences(scene(3)[0], viewpoints=AT_ZERO), voxel_size=VOXEL)
+    verdicts = [h.verdict for h in found.hypotheses if h.verdict is not None]
+    assert len(verdicts) == looked_at < len(found.hypotheses)
+    assert verdicts == sorted(verdicts, reverse=True)
+
+
+@pytest.mark.parametrize(("num_aligned", "moved"), [(0, 0), (1, 1), (6, 2)])
+def test_a_filter_draws_closer_what_it_looks_at(
+    num_aligned: int, moved: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("geomoe3d.filters.motion_judge.CONVINCED", -100.0)
+    rows, _ = scene(3, share=0.1)
+
+    def motions(count: int, given: Correspondences) -> set[bytes]:
+        judge = MotionJudge(network(), estimator=EstimatorConfig(num_aligned=count))
+        return {h.T_target_source.tobytes() for h in judge(given, voxel_size=VOXEL).hypotheses}
+
+    bare = Correspondences(rows, viewpoints=AT_ZERO)
+    assert len(motions(num_aligned, bare) - motions(0, bare)) == moved
+    with_clouds = replace(bare, normals=(np.zeros((len(rows), 3)), np.zeros((len(rows), 3))))
+    assert motions(num_aligned, with_clouds) == motions(0, with_clouds)
 
 
 def test_verdicts_are_the_same_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.clouds.range_image import RangeImage
-from geomoe3d.types import FloatArray
+from geomoe3d.threads import each
+from geomoe3d.types import FloatArray, IntArray
 
 PIXEL_DEG = 5.0
 """Pixels of what a sensor saw: keypoints are sparse, finer ones would stay empty."""
@@ -58,3 +59,40 @@ class Surface:
             normals = np.where(away[:, None], -normals, normals)
             view = RangeImage.of(points, viewpoint, PIXEL_DEG)
         return cls(points, normals, planarity, tree, view, viewpoint)
+
+
+@dataclass(frozen=True)
+class KeypointSurfaces:
+    """Both scans of a pair as `Surface`, and where in them the points of each correspondence are.
+
+    Attributes:
+        sides: source and target.
+        rows: (N,) of each: the keypoint that a correspondence has there.
+    """
+
+    sides: tuple[Surface, Surface]
+    rows: tuple[IntArray, IntArray]
+
+    @classmethod
+    def of(
+        cls,
+        correspondences: FloatArray,
+        viewpoints: tuple[FloatArray | None, FloatArray | None],
+        unit: float,
+    ) -> KeypointSurfaces:
+        """Both sides at once, where there are threads.
+
+        Args:
+            correspondences: (N, 6) finite rows [source xyz, target xyz].
+            viewpoints: (3,) places of the two sensors, or None for either.
+            unit: length that becomes one: the inlier threshold.
+        """
+
+        def side(number: int) -> tuple[Surface, IntArray]:
+            points = correspondences[:, 3 * number : 3 * number + 3] / unit
+            distinct, row = np.unique(points, axis=0, return_inverse=True)
+            viewpoint = viewpoints[number]
+            return Surface.of(distinct, None if viewpoint is None else viewpoint / unit), row.ravel()
+
+        (source, source_row), (target, target_row) = each(side, (0, 1))
+        return cls((source, target), (source_row, target_row))

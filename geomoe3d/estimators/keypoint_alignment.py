@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.geometry.gicp import LEAST_MATCHED, LocalCloud, align
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.threads import each
@@ -19,7 +20,7 @@ from geomoe3d.types import FloatArray, Hypothesis
 
 _NEIGHBORS = 10  # of a keypoint, for the plane it lies in
 _REACH = 1.5  # inlier thresholds; wider slides along walls, narrower leaves motions where they were
-_MOST_STEPS = 20
+_MOST_STEPS = 4  # the first ones do it; more slide along walls
 
 
 class KeypointAligner:
@@ -28,10 +29,19 @@ class KeypointAligner:
     Args:
         correspondences: (N, 6) rows [source xyz, target xyz]; which belongs to which is not asked.
         inlier_threshold: same unit.
+        surfaces: of the same, in inlier thresholds, where somebody has them already.
     """
 
-    def __init__(self, correspondences: FloatArray, inlier_threshold: float) -> None:
-        sides = [np.unique(side, axis=0) for side in np.hsplit(correspondences, 2)]
+    def __init__(
+        self,
+        correspondences: FloatArray,
+        inlier_threshold: float,
+        surfaces: KeypointSurfaces | None = None,
+    ) -> None:
+        if surfaces is None:
+            sides = [np.unique(side, axis=0) for side in np.hsplit(correspondences, 2)]
+        else:
+            sides = [side.points * inlier_threshold for side in surfaces.sides]
         self._clouds: tuple[LocalCloud, LocalCloud] | None = None
         if min(map(len, sides)) >= LEAST_MATCHED:
             self._unit = inlier_threshold / 2  # lengths in voxels, as the limits of `align` are

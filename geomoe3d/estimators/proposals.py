@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
@@ -24,16 +25,19 @@ def propose(
     *,
     inlier_threshold: float,
     seed: int,
+    surfaces: KeypointSurfaces | None = None,
 ) -> list[Hypothesis]:
     """Hypotheses of both rounds, those of the first round first, each round best first.
 
     Args:
         estimate: what proposes.
-        matched: N correspondences; without the attribute ``mutual`` there is one round.
+        matched: N correspondences; without the attribute ``mutual`` there is one round. Where they bring no
+            normals there are no clouds to refine on later, so the keypoints draw motions closer.
         weights: (N,) what a filter says of them.
         config: weight of one-way matches, and whether there is a second round.
         inlier_threshold: cloud units.
         seed: decides every random choice.
+        surfaces: of all the keypoints, in inlier thresholds, where somebody has them already.
 
     Raises:
         InputError: as `Estimator`.
@@ -42,7 +46,12 @@ def propose(
     if matched.mutual is not None:
         weights = weights * np.where(matched.mutual, 1.0, config.one_way_weight)
     asking = getattr(estimate, "with_surroundings", None) if len(matched) else None
-    around = None if asking is None else Surroundings.of(matched, inlier_threshold)
+    around = None
+    if asking is not None:
+        if surfaces is None and matched.normals is None:
+            places = matched.viewpoints or (None, None)
+            surfaces = KeypointSurfaces.of(matched.points, places, inlier_threshold)
+        around = Surroundings.of(matched, inlier_threshold, surfaces)
 
     def of(rows: BoolArray) -> list[Hypothesis]:
         one = estimate if asking is None or around is None else asking(around.take(rows))
@@ -54,9 +63,9 @@ def propose(
     found = of(np.ones(len(matched), dtype=np.bool_))
     if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
         found += of(matched.mutual)
-    if around is not None and found:
+    if around is not None and matched.normals is None and found:
         few, others = found[: config.num_aligned], found[config.num_aligned :]
-        found = KeypointAligner(matched.points, inlier_threshold).hypotheses(few) + others
+        found = KeypointAligner(matched.points, inlier_threshold, surfaces).hypotheses(few) + others
     return found
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.clouds.keypoints import PIXEL_DEG, Surface
+from geomoe3d.clouds.keypoints import PIXEL_DEG, KeypointSurfaces
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.threads import each
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, FloatArray, IntArray
@@ -52,25 +52,30 @@ class Surroundings:
     views: tuple[RangeImage, RangeImage] | None
 
     @classmethod
-    def of(cls, matched: Correspondences, inlier_threshold: float) -> Surroundings:
+    def of(
+        cls, matched: Correspondences, inlier_threshold: float, surfaces: KeypointSurfaces | None = None
+    ) -> Surroundings:
         """Of correspondences; where they bring no normals, planes are fitted to the points of each scan.
 
         Args:
             matched: N finite rows; normals and viewpoints are used where given.
             inlier_threshold: unit of length of the result, same unit as the points.
+            surfaces: of the same, in that unit, where somebody has them already; asked where normals lack.
         """
-
-        def side(number: int) -> tuple[FloatArray, FloatArray, RangeImage | None]:
-            points = matched.points[:, 3 * number : 3 * number + 3] / inlier_threshold
-            place = None if matched.viewpoints is None else matched.viewpoints[number] / inlier_threshold
-            if matched.normals is not None:
-                view = None if place is None else RangeImage.of(points, place, PIXEL_DEG)
-                return points, matched.normals[number], view
-            distinct, row = np.unique(points, axis=0, return_inverse=True)
-            surface = Surface.of(distinct, place)
-            return points, surface.normals[row.ravel()], surface.view
-
-        (p, n, source_view), (q, m, target_view) = each(side, (0, 1))
+        p, q = (side / inlier_threshold for side in np.hsplit(matched.points, 2))
+        if matched.normals is None:
+            known = surfaces or KeypointSurfaces.of(
+                matched.points, matched.viewpoints or (None, None), inlier_threshold
+            )
+            n, m = (side.normals[row] for side, row in zip(known.sides, known.rows, strict=True))
+            source_view, target_view = (side.view for side in known.sides)
+        else:
+            n, m = matched.normals
+            places = matched.viewpoints or (None, None)
+            source_view, target_view = (
+                None if place is None else RangeImage.of(points, place / inlier_threshold, PIXEL_DEG)
+                for points, place in zip((p, q), places, strict=True)
+            )
         views = None if source_view is None or target_view is None else (source_view, target_view)
         # A zero normal says nothing against any plane or motion in particular.
         n, m = np.nan_to_num(n), np.nan_to_num(m)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.clouds.keypoints import Surface
+from geomoe3d.clouds.keypoints import KeypointSurfaces, Surface
 from geomoe3d.estimators.consensus import bundle_weights, distances
 from geomoe3d.threads import each
 from geomoe3d.types import Float32Array, FloatArray, IntArray
@@ -57,6 +57,7 @@ class AlignedChannels:
         correspondences: (N, 6) rows [source xyz, target xyz].
         viewpoints: (3,) places of the two sensors, or None for both.
         inlier_threshold: same unit.
+        surfaces: of the same, in inlier thresholds, where somebody has them already.
     """
 
     def __init__(
@@ -64,20 +65,16 @@ class AlignedChannels:
         correspondences: FloatArray,
         viewpoints: tuple[FloatArray | None, FloatArray | None],
         inlier_threshold: float,
+        surfaces: KeypointSurfaces | None = None,
     ) -> None:
         rows = correspondences / inlier_threshold
         self._threshold = inlier_threshold
         self.rows = rows
 
-        def side(number: int) -> tuple[Surface, IntArray]:
-            points, index = np.unique(rows[:, 3 * number : 3 * number + 3], axis=0, return_inverse=True)
-            viewpoint = viewpoints[number]
-            place = None if viewpoint is None else viewpoint / inlier_threshold
-            return Surface.of(points, place), index.ravel()
-
-        jobs: list[Any] = [partial(side, 0), partial(side, 1), *_degree_jobs(rows)]
-        first, second, *degree = each(lambda job: job(), jobs)
-        (self.source, self._source_row), (self.target, self._target_row) = first, second
+        degree = each(lambda job: job(), _degree_jobs(rows))
+        known = surfaces or KeypointSurfaces.of(correspondences, viewpoints, inlier_threshold)
+        self.source, self.target = known.sides
+        self._source_row, self._target_row = known.rows
         self._fixed = self._constant_channels(np.concatenate(degree))
 
     def _constant_channels(self, degree: Float32Array) -> dict[str, NDArray[Any]]:

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.errors import InputError, NonFiniteError
 from geomoe3d.filters.aligned import AlignedChannels
 from geomoe3d.filters.architecture import NetworkConfig
@@ -123,6 +124,7 @@ class MotionInputs:
         viewpoints: (3,) where the two sensors stood, same coordinates, or None for both.
         voxel_size: in the same unit.
         config: of a network with the channels ``aligned``.
+        surfaces: of the correspondences in units of its compatibility threshold, where somebody has them.
 
     Raises:
         InputError, NonFiniteError: as `pair_input`.
@@ -134,12 +136,13 @@ class MotionInputs:
         viewpoints: tuple[NDArray[Any] | None, NDArray[Any] | None],
         voxel_size: float,
         config: NetworkConfig,
+        surfaces: KeypointSurfaces | None = None,
     ) -> None:
         points, voxels = _check(correspondences, voxel_size, config)
         self._coordinates = voxels / config.unit_voxels
         threshold = config.compatibility_threshold * voxel_size
         self._neighbors = find_neighbors(self._coordinates[None], config)[0]
-        self._aligned = AlignedChannels(points.numpy(), viewpoints, threshold)
+        self._aligned = AlignedChannels(points.numpy(), viewpoints, threshold, surfaces)
 
     def under(self, motions: NDArray[Any]) -> list[PairInput]:
         """One input for each motion p_target = R p_source + t, (K, 4, 4), in the correspondences' frames."""

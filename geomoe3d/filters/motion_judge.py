@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import CheckpointError
 from geomoe3d.estimators.consensus import ConsensusEstimator
+from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.base import FilterOutput
@@ -28,7 +30,7 @@ from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, MotionInputs
 from geomoe3d.filters.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.threads import each, single_blas_thread
-from geomoe3d.types import Correspondences, FloatArray, IntArray
+from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
 
 MOST_MOTIONS = 6
 """Motions that the filter judges of those that consensus proposes."""
@@ -38,6 +40,8 @@ FIRST_MOTIONS = 2
 """Motions that are judged before the filter asks itself whether it has seen enough."""
 CONVINCED = 3.0
 """Verdict from which on the filter looks at no further motions."""
+# A motion drawn closer by the keypoints need not be proposed so well: fewer seeds do than in registration.
+_consensus = partial(ConsensusEstimator, num_seeds=500, num_refined=60)
 _PARTS = 2  # of a lot, side by side; for any number of threads: last bits depend on how many share a batch
 
 
@@ -99,17 +103,25 @@ class MotionJudge:
 
     @single_blas_thread()
     @single_torch_thread()
-    def about(self, correspondences: Correspondences, *, voxel_size: float) -> PairJudge:
+    def about(
+        self,
+        correspondences: Correspondences,
+        *,
+        voxel_size: float,
+        surfaces: KeypointSurfaces | None = None,
+    ) -> PairJudge:
         """The judge of one pair's motions.
 
         Args:
             correspondences: N rows in local coordinates; free space is asked where ``viewpoints`` are given.
             voxel_size: the grid the points came from.
+            surfaces: of the correspondences, see `MotionInputs`, where somebody has them already.
         """
         seen, part = finite_part(correspondences)
         inputs = None
         if len(seen) >= MIN_CORRESPONDENCES:
-            inputs = MotionInputs(part.points, part.viewpoints or (None, None), voxel_size, self.config)
+            views = part.viewpoints or (None, None)
+            inputs = MotionInputs(part.points, views, voxel_size, self.config, surfaces)
         return PairJudge(self._network, self.config, self.device, inputs, seen, len(correspondences))
 
     @single_blas_thread()
@@ -118,32 +130,46 @@ class MotionJudge:
 
         Returns:
             Weights, and as ``hypotheses`` what consensus proposed: those looked at, of the first
-            `MOST_MOTIONS`, in the order of their verdicts, then the others. Where no motion is proposed all
-            weights are 0.
+            `MOST_MOTIONS`, drawn closer by the keypoints, in the order of their verdicts, then the others.
+            Where no motion is proposed all weights are 0.
         """
         seen, part = finite_part(correspondences)
         blind = Insight.blind(len(correspondences), self.config.num_layers).output(self.config)
         if len(seen) < MIN_CORRESPONDENCES:
             return blind
+        threshold = self._proposing.inlier_threshold * voxel_size
+        few = likeliest_rows(part, MOST_ROWS, seed)
+        surfaces = None
+        if few is part and self._proposing.inlier_threshold == self.config.compatibility_threshold:
+            surfaces = KeypointSurfaces.of(part.points, part.viewpoints or (None, None), threshold)
         found = propose(
-            ConsensusEstimator(num_hypotheses=self._proposing.num_hypotheses),
+            _consensus(num_hypotheses=self._proposing.num_hypotheses),
             part,
             np.ones(len(part)),
-            self._proposing,
-            inlier_threshold=self._proposing.inlier_threshold * voxel_size,
+            self._proposing.model_copy(update={"num_aligned": 0}),  # only those looked at, below
+            inlier_threshold=threshold,
             seed=seed,
+            surfaces=surfaces,
         )
         if not found:
             return blind
-        few = likeliest_rows(part, MOST_ROWS, seed)
-        first = found[:MOST_MOTIONS]
-        motions = np.array([h.T_target_source for h in first])
-        judged = self.about(few, voxel_size=voxel_size)(motions, CONVINCED)
+        aligner = KeypointAligner(part.points, threshold, surfaces)
+        num_aligned = self._proposing.num_aligned if part.normals is None else 0
+        ask = self.about(few, voxel_size=voxel_size, surfaces=surfaces)
+        first: list[Hypothesis] = []
+        judged: list[Judged] = []
+        for lot in (found[:FIRST_MOTIONS], found[FIRST_MOTIONS:MOST_MOTIONS]):
+            if lot and all(j.verdict < CONVINCED for j in judged):
+                count = max(num_aligned - len(first), 0)
+                lot = aligner.hypotheses(lot[:count]) + lot[count:]
+                judged += ask(np.array([h.T_target_source for h in lot]))
+                first += lot
         order = np.argsort([-j.verdict for j in judged], kind="stable")
         ranked = [replace(first[k], verdict=judged[k].verdict) for k in order]
         output: FilterOutput = judged[order[0]].output
         if few is not correspondences:  # judged on some rows, weighed on all
-            output = self.about(correspondences, voxel_size=voxel_size)(motions[order[:1]])[0].output
+            best = ranked[0].T_target_source[None]
+            output = self.about(correspondences, voxel_size=voxel_size)(best)[0].output
         return replace(output, hypotheses=(*ranked, *found[len(judged) :]))
 
 
@@ -164,26 +190,19 @@ class PairJudge:
 
     @single_blas_thread()
     @single_torch_thread()
-    def __call__(self, motions: FloatArray, enough: float = np.inf) -> list[Judged]:
+    def __call__(self, motions: FloatArray) -> list[Judged]:
         """Judge motions, several at a time where there are threads.
 
         Args:
             motions: (K, 4, 4) p_target = R p_source + t, local coordinates.
-            enough: where one of the first `FIRST_MOTIONS` is given a verdict as high as this, the others are
-                not looked at.
 
         Returns:
-            One per motion looked at, in order; none where fewer than 3 rows are finite.
+            One per motion, in order; none where fewer than 3 rows are finite.
         """
-        found: list[Judged] = []
-        if self._inputs is None:
-            return found
-        first = len(motions) if enough == np.inf else FIRST_MOTIONS
-        for lot in (motions[:first], motions[first:]):
-            if len(lot) and all(j.verdict < enough for j in found):
-                parts = np.array_split(lot, min(_PARTS, len(lot)))
-                found += [judged for part in each(self._judge, parts) for judged in part]
-        return found
+        if self._inputs is None or len(motions) == 0:
+            return []
+        parts = np.array_split(motions, min(_PARTS, len(motions)))
+        return [judged for part in each(self._judge, parts) for judged in part]
 
     def _judge(self, motions: FloatArray) -> list[Judged]:
         helper_keeps_to_one_torch_thread()

@@ -20,6 +20,7 @@ from geomoe3d.config import EstimatorConfig
 from geomoe3d.data.draw import DrawSettings, FragmentPool
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
+from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.files import write_atomically
 from geomoe3d.training.fragment_pairs import as_training_pair
@@ -28,7 +29,7 @@ from geomoe3d.types import BoolArray, Correspondences
 from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 NUM_MOTIONS = 24
-PROPOSER_VERSION = 2
+PROPOSER_VERSION = 3
 """Raise it with every change of what consensus proposes: motions of two kinds must not share a folder."""
 PAIRS_PER_SHARD = 100
 SETTINGS = DrawSettings(
@@ -39,7 +40,7 @@ among those proposed teach to doubt."""
 
 
 _IDENTITY = "motions.json"
-_PROPOSING = EstimatorConfig(mutual_round=False)
+_PROPOSING = EstimatorConfig(mutual_round=False, num_aligned=0)
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,9 @@ def _pairs(pool: FragmentPool, first: int) -> Iterator[TrainingPair]:
 def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> TrainingPair:
     """The pair with at most `NUM_MOTIONS` motions proposed for it, best first; the sensors are at zero.
 
-    Described fragments have their sensor at the origin, see `geomoe3d.data.describe.describe_fragment`.
+    Every second one is drawn closer by the keypoints: bare correspondences show the network such motions,
+    registration shows it those that consensus fitted. Described fragments have their sensor at zero, see
+    `geomoe3d.data.describe.describe_fragment`.
 
     Args:
         pair: with at least 3 correspondences.
@@ -173,4 +176,7 @@ def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> Trainin
     rows = Correspondences(pair.correspondences.astype(np.float64), mutual=mutual, viewpoints=at_zero)
     found = propose(estimator, rows, np.ones(len(rows)), _PROPOSING, inlier_threshold=threshold, seed=0)
     motions = np.array([h.T_target_source for h in found]).reshape(-1, 4, 4)
+    aligner = KeypointAligner(rows.points, threshold)
+    for k in range(1, len(motions), 2):
+        motions[k] = aligner(motions[k])
     return replace(pair, motions=motions, viewpoints=np.zeros((2, 3)))

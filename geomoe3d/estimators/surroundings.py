@@ -62,20 +62,23 @@ class Surroundings:
             inlier_threshold: unit of length of the result, same unit as the points.
             surfaces: of the same, in that unit, where somebody has them already; asked where normals lack.
         """
-        p, q = (side / inlier_threshold for side in np.hsplit(matched.points, 2))
+        points = [side / inlier_threshold for side in np.hsplit(matched.points, 2)]
+        places = matched.viewpoints or (None, None)
         if matched.normals is None:
-            known = surfaces or KeypointSurfaces.of(
-                matched.points, matched.viewpoints or (None, None), inlier_threshold
-            )
-            n, m = (side.normals[row] for side, row in zip(known.sides, known.rows, strict=True))
+            known = surfaces or KeypointSurfaces.of(matched.points, places, inlier_threshold)
+            normals = [side.normals[row] for side, row in zip(known.sides, known.rows, strict=True)]
             source_view, target_view = (side.view for side in known.sides)
         else:
-            n, m = matched.normals
-            places = matched.viewpoints or (None, None)
-            source_view, target_view = (
-                None if place is None else RangeImage.of(points, place / inlier_threshold, PIXEL_DEG)
-                for points, place in zip((p, q), places, strict=True)
-            )
+            normals = list(matched.normals)
+
+            def view(number: int) -> RangeImage | None:
+                place = places[number]
+                if place is None:
+                    return None
+                return RangeImage.of(points[number], place / inlier_threshold, PIXEL_DEG)
+
+            source_view, target_view = each(view, (0, 1))
+        (p, q), (n, m) = points, normals
         views = None if source_view is None or target_view is None else (source_view, target_view)
         # A zero normal says nothing against any plane or motion in particular.
         n, m = np.nan_to_num(n), np.nan_to_num(m)

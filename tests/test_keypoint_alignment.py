@@ -41,8 +41,15 @@ def test_a_motion_nearby_is_drawn_to_the_truth(seed: int) -> None:
     np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
 
 
+def test_where_a_fifth_of_the_correspondences_agree_their_fit_stands() -> None:
+    rows, T = scene(1, count=600, share=0.3)
+    assert KeypointAligner(rows, THRESHOLD)(T) is T
+    fewer = np.vstack([rows[:90], rows[180:]])  # 90 of 510
+    assert KeypointAligner(fewer, THRESHOLD)(T) is not T
+
+
 def test_which_point_belongs_to_which_does_not_matter_and_nothing_is_changed() -> None:
-    rows, T = scene(1, count=600)
+    rows, T = scene(1, count=600, share=0.1)
     start = nudged(T, rows[:, :3], 1)
     kept = rows.copy(), start.copy()
     order = np.random.default_rng(0).permutation(len(rows))
@@ -55,7 +62,7 @@ def test_which_point_belongs_to_which_does_not_matter_and_nothing_is_changed() -
 
 @pytest.mark.parametrize(("scale", "origin"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 5e5)])
 def test_unit_and_frame_do_not_matter(scale: float, origin: float) -> None:
-    rows, T = scene(2, count=600)
+    rows, T = scene(2, count=600, share=0.1)
     start = nudged(T, rows[:, :3], 2)
     plain = KeypointAligner(rows, THRESHOLD)(start)
     moved = start.copy()
@@ -67,7 +74,7 @@ def test_unit_and_frame_do_not_matter(scale: float, origin: float) -> None:
 
 
 def test_where_nothing_is_near_the_motion_stays_as_it_was() -> None:
-    rows, T = scene(3)
+    rows, T = scene(3, share=0.1)
     far = T.copy()
     far[:3, 3] += 100
     assert KeypointAligner(rows, THRESHOLD)(far) is far
@@ -75,12 +82,12 @@ def test_where_nothing_is_near_the_motion_stays_as_it_was() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 3, 9])
 def test_few_points_are_no_surface(count: int) -> None:
-    rows, T = scene(3)
+    rows, T = scene(3, share=0.0)
     assert KeypointAligner(rows[:count], THRESHOLD)(T) is T
 
 
 def test_points_that_coincide_do_not_bring_it_down() -> None:
-    rows, T = scene(3)
+    rows, T = scene(3, share=0.1)
     same = np.hstack([rows[:, :3], np.repeat(rows[:1, 3:], len(rows), axis=0)])
     assert KeypointAligner(same, THRESHOLD)(T) is T
     flat = rows * [1, 1, 0, 1, 1, 0]

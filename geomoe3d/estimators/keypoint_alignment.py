@@ -57,7 +57,7 @@ class KeypointAligner:
             self._clouds = source, target
 
     def __call__(self, T_target_source: FloatArray) -> FloatArray:
-        """The motion (4, 4) drawn closer, or the same where that fails or a fifth of the rows agree with it."""
+        """The motion (4, 4) drawn closer; the same where that fails or a fifth of the rows agree with it."""
         if self._clouds is None:
             return T_target_source
         gaps = residuals(T_target_source, *np.hsplit(self._correspondences, 2))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from corner_scenes import VOXEL, random_motion, seen_corner
+from corner_scenes import VOXEL, random_motion, scene, seen_corner
 from judged_motions import SMALL, training_pair
 from scipy.spatial.transform import Rotation
 
@@ -25,7 +25,7 @@ from geomoe3d.training.config import TrainConfig, load_train_config
 from geomoe3d.training.losses import verdict_loss
 from geomoe3d.training.measures import evaluate
 from geomoe3d.training.motions import NUM_MOTIONS, propose_motions, with_motions
-from geomoe3d.training.pairs import ShardFolder, write_shard
+from geomoe3d.training.pairs import ShardFolder, TrainingPair, write_shard
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -46,6 +46,19 @@ def test_motions_are_kept_in_shards(tmp_path: Path) -> None:
     (tmp_path / "a" / "motion_start.npy").unlink()
     with pytest.raises(FormatError, match="lacks motion_start"):
         ShardFolder(tmp_path)[0]
+
+
+def test_every_second_motion_is_drawn_closer(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, T = scene(3, share=0.1)
+    pair = TrainingPair(rows.astype(np.float32), np.arange(len(rows)) < 0.1 * len(rows), T, VOXEL)
+    drawn = with_motions(pair).motions
+    monkeypatch.setattr(motions_module, "KeypointAligner", lambda *_: lambda motion: motion)
+    plain = with_motions(pair).motions
+    assert drawn is not None
+    assert plain is not None
+    same = (drawn == plain).all((1, 2))
+    assert same[::2].all()
+    assert not same[1::2].all()
 
 
 def test_a_right_motion_is_among_those_chosen_for_training() -> None:

@@ -83,8 +83,8 @@ class EstimatorConfig(Section):
     num_aligned: int = Field(
         6,
         ge=0,
-        description="so many of them, best first, are drawn closer by the keypoints of both scans; "
-        "correspondences without clouds only, since clouds do it better",
+        description="so many of them, best first, are drawn closer by the keypoints of both scans (by geomoe "
+        "of those it looks at); correspondences without clouds only, since clouds do it better",
     )
     one_way_weight: float = Field(
         0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"

@@ -13,8 +13,15 @@ from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points, translation_error
-from geomoe3d.types import Correspondences, FloatArray
+from geomoe3d.geometry.se3 import (
+    make_transform,
+    residuals,
+    rotation_error_deg,
+    shift_frames,
+    transform_points,
+    translation_error,
+)
+from geomoe3d.types import Correspondences, FloatArray, Hypothesis
 
 THRESHOLD = 2 * VOXEL
 
@@ -81,8 +88,9 @@ def test_where_nothing_is_near_the_motion_stays_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 9])
-def test_few_points_are_no_surface(count: int) -> None:
+def test_few_points_are_no_surface(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, T = scene(3, share=0.0)
+    monkeypatch.setattr("geomoe3d.estimators.keypoint_alignment.align", None)  # is not even called
     assert KeypointAligner(rows[:count], THRESHOLD)(T) is T
 
 
@@ -90,8 +98,60 @@ def test_points_that_coincide_do_not_bring_it_down() -> None:
     rows, T = scene(3, share=0.1)
     same = np.hstack([rows[:, :3], np.repeat(rows[:1, 3:], len(rows), axis=0)])
     assert KeypointAligner(same, THRESHOLD)(T) is T
-    flat = rows * [1, 1, 0, 1, 1, 0]
-    assert np.isfinite(KeypointAligner(flat, THRESHOLD)(np.eye(4))).all()
+
+
+def test_a_motion_that_would_lose_half_of_its_correspondences_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, T = scene(1, count=600, share=0.1)
+    slid = T.copy()
+    slid[:3, 3] += 0.1 * THRESHOLD
+    far = T.copy()
+    far[:3, 3] += 2 * THRESHOLD
+    for given, kept in ((slid, False), (far, True)):
+        in_units = KeypointAligner(rows, THRESHOLD)
+        monkeypatch.setattr(
+            "geomoe3d.estimators.keypoint_alignment.align",
+            lambda *_, T=given, a=in_units, **__: (scaled(T, a), None),
+        )
+        found = in_units(T)
+        assert (found is T) is kept
+
+
+def scaled(T: FloatArray, aligner: KeypointAligner) -> FloatArray:
+    """T as the alignment would give it: about the keypoints' means, in its units."""
+    source, target = aligner._centres
+    made = shift_frames(T, -source, -target)
+    made[:3, 3] /= aligner._unit
+    return made
+
+
+def test_hypotheses_count_the_inliers_of_the_motion_drawn_closer() -> None:
+    rows, T = scene(2, count=1000, share=0.1)
+    start = nudged(T, rows[:, :3], 2)
+    before = Hypothesis(start, 7.0, 1)
+    (found,) = KeypointAligner(rows, THRESHOLD).hypotheses([before])
+    gaps = residuals(found.T_target_source, rows[:, :3], rows[:, 3:])
+    assert found.num_inliers == (gaps < THRESHOLD).sum() > 90
+    assert found.score == 7.0
+
+
+@pytest.mark.parametrize("normals", [False, True])
+def test_proposals_of_clouds_are_left_to_the_clouds(normals: bool) -> None:
+    rows, _ = scene(5, count=500, share=0.05)
+    zero = np.zeros((len(rows), 3))
+    given = Correspondences(rows, viewpoints=AT_ZERO, normals=(zero, zero) if normals else None)
+
+    def motions(count: int) -> list[bytes]:
+        found = propose(
+            ConsensusEstimator(num_hypotheses=8),
+            given,
+            np.ones(len(rows)),
+            EstimatorConfig(num_aligned=count),
+            inlier_threshold=THRESHOLD,
+            seed=0,
+        )
+        return [h.T_target_source.tobytes() for h in found]
+
+    assert (motions(3) == motions(0)) is normals
 
 
 def test_so_many_proposals_are_drawn_closer_as_the_configuration_says() -> None:

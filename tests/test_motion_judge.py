@@ -13,6 +13,7 @@ from judged_motions import network, turned
 
 from geomoe3d.config import EstimatorConfig, build_config
 from geomoe3d.errors import CheckpointError
+from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.folded import FoldedGeoMoE
 from geomoe3d.filters.geomoe import GeoMoE
@@ -20,7 +21,7 @@ from geomoe3d.filters.geomoe_filter import GeoMoEFilter
 from geomoe3d.filters.inputs import MotionInputs, collate
 from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
 from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.types import Correspondences
+from geomoe3d.types import Correspondences, Hypothesis
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -119,21 +120,54 @@ def test_a_filter_stops_where_it_has_seen_enough(
     assert verdicts == sorted(verdicts, reverse=True)
 
 
-@pytest.mark.parametrize(("num_aligned", "moved"), [(0, 0), (1, 1), (6, 2)])
+@pytest.mark.parametrize(
+    ("convinced", "num_aligned", "moved"), [(-100.0, 1, 1), (-100.0, 6, 2), (100.0, 6, 6)]
+)
 def test_a_filter_draws_closer_what_it_looks_at(
-    num_aligned: int, moved: int, monkeypatch: pytest.MonkeyPatch
+    convinced: float, num_aligned: int, moved: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("geomoe3d.filters.motion_judge.CONVINCED", -100.0)
+    monkeypatch.setattr("geomoe3d.filters.motion_judge.CONVINCED", convinced)
+    monkeypatch.setattr("geomoe3d.estimators.keypoint_alignment._KEPT_AGREEMENT", 0.0)  # wrong ones slide
+    # The same proposals whether or not they are drawn closer.
+    monkeypatch.setattr("geomoe3d.filters.motion_judge._NUM_SEEDS", ConsensusEstimator().num_seeds)
+    monkeypatch.setattr("geomoe3d.filters.motion_judge._NUM_REFINED", ConsensusEstimator().num_refined)
     rows, _ = scene(3, share=0.1)
 
-    def motions(count: int, given: Correspondences) -> set[bytes]:
+    def found(count: int, given: Correspondences) -> list[Hypothesis]:
         judge = MotionJudge(network(), estimator=EstimatorConfig(num_aligned=count))
-        return {h.T_target_source.tobytes() for h in judge(given, voxel_size=VOXEL).hypotheses}
+        return list(judge(given, voxel_size=VOXEL).hypotheses)
+
+    def motions(hypotheses: list[Hypothesis]) -> set[bytes]:
+        return {h.T_target_source.tobytes() for h in hypotheses}
 
     bare = Correspondences(rows, viewpoints=AT_ZERO)
-    assert len(motions(num_aligned, bare) - motions(0, bare)) == moved
+    drawn, plain = found(num_aligned, bare), found(0, bare)
+    assert len(drawn) == len(plain)
+    assert len(motions(drawn) - motions(plain)) in moved  # one that would slide far away stays
     with_clouds = replace(bare, normals=(np.zeros((len(rows), 3)), np.zeros((len(rows), 3))))
-    assert motions(num_aligned, with_clouds) == motions(0, with_clouds)
+    assert motions(found(num_aligned, with_clouds)) == motions(found(0, with_clouds))
+
+
+@pytest.mark.parametrize("threshold", [2.0, 3.0])
+def test_a_filter_judges_the_motions_that_it_gives(threshold: float) -> None:
+    """Whether or not its surfaces, in inlier thresholds, are those that the network wants."""
+    rows, _ = scene(3, share=0.1)
+    given = Correspondences(rows, viewpoints=AT_ZERO)
+    judge = MotionJudge(network(), estimator=EstimatorConfig(inlier_threshold=threshold))
+    looked_at = [h for h in judge(given, voxel_size=VOXEL).hypotheses if h.verdict is not None]
+    again = judge.about(given, voxel_size=VOXEL)(np.array([h.T_target_source for h in looked_at]))
+    assert len(looked_at) >= 2
+    assert [h.verdict for h in looked_at] == pytest.approx([j.verdict for j in again], abs=1e-4)
+
+
+def test_a_filter_gives_the_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = Correspondences(scene(3, count=600, share=0.1)[0], viewpoints=AT_ZERO)
+    found = []
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        output = MotionJudge(network())(given, voxel_size=VOXEL)
+        found.append((output.weights.tobytes(), [h.T_target_source.tobytes() for h in output.hypotheses]))
+    assert found[0] == found[1] == found[2]
 
 
 def test_verdicts_are_the_same_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,8 @@ from geomoe3d.types import FloatArray, IntArray
 
 PIXEL_DEG = 5.0
 """Pixels of what a sensor saw: keypoints are sparse, finer ones would stay empty."""
-_NORMAL_NEIGHBORS = 10
+NORMAL_NEIGHBORS = 10
+"""Keypoints whose plane a keypoint lies in."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Surface:
         from scipy.spatial import cKDTree
 
         tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        k = min(_NORMAL_NEIGHBORS, len(points))
+        k = min(NORMAL_NEIGHBORS, len(points))
         _, near = tree.query(points, k=k)
         patch = points[np.asarray(near).reshape(len(points), k)]
         patch = patch - patch.mean(1, keepdims=True)

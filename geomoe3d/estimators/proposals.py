@@ -27,14 +27,14 @@ def propose(
     seed: int,
     surfaces: KeypointSurfaces | None = None,
 ) -> list[Hypothesis]:
-    """Hypotheses of both rounds, those of the first round first, each round best first.
+    """Hypotheses of both rounds, those of the first round first, each round best first as it was proposed.
 
     Args:
         estimate: what proposes.
         matched: N correspondences; without the attribute ``mutual`` there is one round. Where they bring no
-            normals there are no clouds to refine on later, so the keypoints draw motions closer.
+            normals there are no clouds to refine on later: the keypoints draw closer what consensus proposes.
         weights: (N,) what a filter says of them.
-        config: weight of one-way matches, and whether there is a second round.
+        config: weight of one-way matches, whether there is a second round, how many motions are drawn closer.
         inlier_threshold: cloud units.
         seed: decides every random choice.
         surfaces: of all the keypoints, in inlier thresholds, where somebody has them already.
@@ -63,7 +63,7 @@ def propose(
     found = of(np.ones(len(matched), dtype=np.bool_))
     if config.mutual_round and matched.mutual is not None and not matched.mutual.all():
         found += of(matched.mutual)
-    if around is not None and matched.normals is None and found:
+    if around is not None and matched.normals is None and config.num_aligned:
         few, others = found[: config.num_aligned], found[config.num_aligned :]
         found = KeypointAligner(matched.points, inlier_threshold, surfaces).hypotheses(few) + others
     return found

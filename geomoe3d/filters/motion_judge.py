@@ -1,8 +1,9 @@
 """A GeoMoE that sees correspondences under given motions: how sure of each, and which rows are inliers.
 
-As a filter it lets consensus propose motions, judges them, and weighs the correspondences under the motion
-that it likes best. Registration asks it about the motions that the clouds like best. Cost at N =
-1000 on one core: about 10 ms, and 3 ms per motion; motions are judged side by side on more.
+As a filter it lets consensus propose motions, has the keypoints draw them closer, judges them, and weighs the
+correspondences under the motion that it likes best. Registration asks it about the motions that the clouds
+like best. Cost at N = 1000 on one core: about 10 ms, and 5 ms per motion; motions are judged side by side on
+more.
 """
 
 from __future__ import annotations
@@ -40,8 +41,7 @@ FIRST_MOTIONS = 2
 """Motions that are judged before the filter asks itself whether it has seen enough."""
 CONVINCED = 3.0
 """Verdict from which on the filter looks at no further motions."""
-# A motion drawn closer by the keypoints need not be proposed so well: fewer seeds do than in registration.
-_consensus = partial(ConsensusEstimator, num_seeds=500, num_refined=60)
+_NUM_SEEDS, _NUM_REFINED = 500, 60  # of consensus: motions to be drawn closer need not be proposed so well
 _PARTS = 2  # of a lot, side by side; for any number of threads: last bits depend on how many share a batch
 
 
@@ -115,7 +115,7 @@ class MotionJudge:
         Args:
             correspondences: N rows in local coordinates; free space is asked where ``viewpoints`` are given.
             voxel_size: the grid the points came from.
-            surfaces: of the correspondences, see `MotionInputs`, where somebody has them already.
+            surfaces: of the finite ones, see `MotionInputs`, where somebody has them already.
         """
         seen, part = finite_part(correspondences)
         inputs = None
@@ -130,8 +130,8 @@ class MotionJudge:
 
         Returns:
             Weights, and as ``hypotheses`` what consensus proposed: those looked at, of the first
-            `MOST_MOTIONS`, drawn closer by the keypoints, in the order of their verdicts, then the others.
-            Where no motion is proposed all weights are 0.
+            `MOST_MOTIONS`, drawn closer by the keypoints as far as ``num_aligned`` of the configuration says,
+            in the order of their verdicts; then the others. Where no motion is proposed all weights are 0.
         """
         seen, part = finite_part(correspondences)
         blind = Insight.blind(len(correspondences), self.config.num_layers).output(self.config)
@@ -142,8 +142,12 @@ class MotionJudge:
         surfaces = None
         if few is part and self._proposing.inlier_threshold == self.config.compatibility_threshold:
             surfaces = KeypointSurfaces.of(part.points, part.viewpoints or (None, None), threshold)
+        num_aligned = self._proposing.num_aligned if part.normals is None else 0
+        estimate = ConsensusEstimator(num_hypotheses=self._proposing.num_hypotheses)
+        if num_aligned:
+            estimate = replace(estimate, num_seeds=_NUM_SEEDS, num_refined=_NUM_REFINED)
         found = propose(
-            _consensus(num_hypotheses=self._proposing.num_hypotheses),
+            estimate,
             part,
             np.ones(len(part)),
             self._proposing.model_copy(update={"num_aligned": 0}),  # only those looked at, below
@@ -154,7 +158,6 @@ class MotionJudge:
         if not found:
             return blind
         aligner = KeypointAligner(part.points, threshold, surfaces)
-        num_aligned = self._proposing.num_aligned if part.normals is None else 0
         ask = self.about(few, voxel_size=voxel_size, surfaces=surfaces)
         first: list[Hypothesis] = []
         judged: list[Judged] = []
@@ -169,7 +172,8 @@ class MotionJudge:
         output: FilterOutput = judged[order[0]].output
         if few is not correspondences:  # judged on some rows, weighed on all
             best = ranked[0].T_target_source[None]
-            output = self.about(correspondences, voxel_size=voxel_size)(best)[0].output
+            everything = self.about(correspondences, voxel_size=voxel_size, surfaces=surfaces)
+            output = everything(best)[0].output
         return replace(output, hypotheses=(*ranked, *found[len(judged) :]))
 
 

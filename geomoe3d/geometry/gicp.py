@@ -1,6 +1,6 @@
 """Local alignment of two sets of points from a start, by small_gicp: GICP or point-to-plane ICP.
 
-One thread aligns, so that the same input gives the same bytes on any machine. Lengths must be near one, since
+One thread aligns, so that the same input gives the same bytes on any machine. Lengths are in voxels, since
 the library's stopping rules are absolute. It calls itself converged even where nothing matched, so what came
 of it is checked here.
 """
@@ -18,7 +18,7 @@ from geomoe3d.types import FloatArray
 LEAST_MATCHED = 10
 """Matching points below which an alignment is not believed."""
 _MAX_TURN_DEG = 15.0  # a local method that turns further has left the motion it was to polish
-_MAX_SHIFT = 6.0
+_MAX_SHIFT = 6.0  # voxels
 # A step that moves less (and turns less than 0.1 deg, the library's own) ends it; ten times less takes twice
 # the steps for nothing.
 _STILL = 0.01
@@ -70,8 +70,8 @@ def align(
     """The motion near ``start`` that draws the source's points into the target's surface.
 
     Args:
-        source: moving points; covariances for GICP.
-        target: fixed points with covariances and normals.
+        source: moving points, in voxels; covariances for GICP.
+        target: fixed points, likewise, with covariances and normals.
         start: (4, 4) p_target = R p_source + t.
         centre: (3,) point of the source at which the shift is measured.
         reach: largest distance of matched points.

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from method_pairs import MOTION, correspondences
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.data.sample import make_sample_pair
@@ -21,7 +22,6 @@ from geomoe3d.geometry.se3 import (
     translation_error,
 )
 
-MOTION = make_transform(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([1.5, -0.5, 2.0]))
 UTM = np.array([583394.0, 5283100.0, 498.0])
 ON_CORRESPONDENCES = [name for name, make in PEERS.items() if "correspondences" in make().inputs]
 ON_CLOUDS = [name for name, make in PEERS.items() if "clouds" in make().inputs]
@@ -35,15 +35,6 @@ def present(name: str):
     if reason is not None:
         pytest.skip(reason)
     return peer
-
-
-def correspondences(share: float, seed: int = 0, count: int = 400) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    source = rng.uniform(-2, 2, (count, 3))
-    target = transform_points(MOTION, source) + rng.normal(0, 0.01, (count, 3))
-    wrong = rng.permutation(count)[: round((1 - share) * count)]
-    target[wrong] = rng.uniform(-3, 3, (len(wrong), 3)) + MOTION[:3, 3]
-    return np.hstack([source, target])
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +53,7 @@ def clouds(source: np.ndarray, target: np.ndarray) -> MethodInput:
 @pytest.mark.parametrize("name", ON_CORRESPONDENCES)
 def test_lands_on_correspondences(name):
     peer = present(name)
-    rows = correspondences(0.6)
+    rows = correspondences(0.6, count=400)
     answer = peer(MethodInput("room/0-1", correspondences=rows))
     assert answer.T_target_source is not None
     assert rotation_error_deg(answer.T_target_source, MOTION) < 1.5
@@ -73,7 +64,7 @@ def test_lands_on_correspondences(name):
 @pytest.mark.parametrize("name", ON_CORRESPONDENCES)
 def test_map_coordinates_do_not_matter(name):
     peer = present(name)
-    rows = correspondences(0.6)
+    rows = correspondences(0.6, count=400)
     answer = peer(MethodInput("room/0-1", correspondences=rows + np.tile(UTM, 2)))
     moved = transform_points(answer.T_target_source, rows[:, :3] + UTM) - UTM
     assert np.abs(moved - transform_points(MOTION, rows[:, :3])).max() < 0.15
@@ -153,7 +144,7 @@ def test_hopeless_clouds_never_give_the_identity(name):
 
 @pytest.mark.parametrize("name", sorted(set(ON_CORRESPONDENCES) - set(UNSEEDED)))
 def test_same_seed_same_answer(name):
-    peer, rows = present(name), correspondences(0.3)
+    peer, rows = present(name), correspondences(0.3, count=400)
     one, two = (
         peer(MethodInput("a/0-1", correspondences=rows, seed=4)).T_target_source.tobytes() for _ in range(2)
     )
@@ -215,7 +206,7 @@ def test_a_librarys_complaint_is_an_error_of_the_pair(monkeypatch):
 
     monkeypatch.setattr(Open3DRansac, "register", complain)
     with pytest.raises(InputError, match=r"a/0-1: 'open3d-ransac-50k': RuntimeError: \[Open3D Error\] no"):
-        Open3DRansac()(MethodInput("a/0-1", correspondences=correspondences(1.0)))
+        Open3DRansac()(MethodInput("a/0-1", correspondences=correspondences(1.0, count=400)))
 
 
 def test_identity_follows_the_settings():

@@ -18,9 +18,10 @@ from geomoe3d.errors import FormatError, OutputError
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.result import Alternative, CloudReport
 from geomoe3d.visual.page import save_page
-from geomoe3d.visual.picture import draw_picture, save_picture, xray
+from geomoe3d.visual.picture import draw_picture, save_picture
 from geomoe3d.visual.scene import build_scene
 from geomoe3d.visual.view import RegistrationView
+from geomoe3d.visual.xray import xray
 
 DATA = Path(os.environ.get("GEOMOE3D_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 

@@ -1,0 +1,217 @@
+"""A survey: the scans of one model with what is known so far, the pairs to try next, the groups."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from geomoe3d.batch.run import Labour, work
+from geomoe3d.batch.store import BatchStore, Outcome
+from geomoe3d.batch.table import PairRow
+from geomoe3d.batch.task import open_cache
+from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.journal import read_journal
+from geomoe3d.multiway.alignment import Surface, align_scans
+from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
+from geomoe3d.multiway.grouping import Group, GroupingRules, group_scans, settle
+from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.multiway.proposals import scan_similarity
+from geomoe3d.multiway.scans import Scan, natural_key
+from geomoe3d.registration import Registrar
+from geomoe3d.stages import StageClock
+from geomoe3d.types import Float32Array, FloatArray
+
+_MOST_SETTLINGS = 3
+_TOLERANCE = 4.0  # voxels; see GroupingRules
+_NEAR_TOLERANCE = 2.5
+_KEPT_TOLERANCE = 1.5
+_KEPT_ERROR = 3.0
+_CLOSING_OVERLAP = 0.3
+_CLOSING_PER_SCAN = 1
+
+PairKey = tuple[int, int]
+
+
+class Survey:
+    """The scans of one call with what is known of them so far."""
+
+    def __init__(
+        self,
+        scans: list[Scan],
+        config: RegistrationConfig,
+        store: BatchStore,
+        labour: Labour,
+        progress: Callable[[int, int], None] | None,
+        say: Callable[[str], None],
+    ) -> None:
+        self.scans, self.config, self.store, self.labour = scans, config, store, labour
+        self.progress, self.say = progress, say
+        self.voxel_size = float(config.voxel_size or 0.0)
+        tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE, _KEPT_ERROR)
+        self.rules = GroupingRules(*(tolerance * self.voxel_size for tolerance in tolerances))
+        self.unusable: dict[int, str] = {}
+        self.shapes: list[Shape] = []
+        self.surfaces: dict[int, Surface] = {}
+        self.aligned: dict[tuple[tuple[int, bytes], ...], dict[int, FloatArray]] = {}
+        self.overlaps = Overlaps({})
+        self.similarity: FloatArray = np.zeros((0, 0))
+        self.outcomes: dict[PairKey, Outcome] = {}
+        self.edges: dict[PairKey, Edge] = {}
+
+    # ---- the scans by themselves
+
+    def describe(self, unusable: dict[str, str]) -> None:
+        """Every scan on the common grid: where its points lie, and how similar it is to the others."""
+        registrar = Registrar(self.config, cache=open_cache(self.labour.cache))
+        features: dict[int, Float32Array] = {}
+        nowhere = Shape(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3))
+        for number, scan in enumerate(self.scans):
+            self.shapes.append(nowhere)
+            try:
+                if scan.name in unusable:
+                    raise InputError(unusable[scan.name])
+                cloud = load_points(scan.path)
+                view = find_viewpoints(cloud, cloud, self.config.preparation.viewpoint)[0]
+                described = registrar.describe_cloud(cloud, self.voxel_size, view, StageClock())
+            except GeoMoE3DError as error:
+                self.unusable[number] = str(error)
+                continue
+            assert described.features is not None
+            features[number] = described.features
+            self.shapes[number] = Shape.of(described.points, described.origin, described.viewpoint)
+            self.surfaces[number] = Surface.of(described)
+        if len(features) < 2:
+            raise InputError(f"fewer than 2 scans can be used: {'; '.join(self.unusable.values())}")
+        points = {number: surface.points for number, surface in self.surfaces.items()}
+        self.overlaps = Overlaps(points, seed=self.config.seed)
+        self.similarity = np.full((len(self.scans), len(self.scans)), -np.inf)
+        usable = list(features)
+        between = scan_similarity([features[k] for k in usable], seed=self.config.seed)
+        self.similarity[np.ix_(usable, usable)] = between
+        np.fill_diagonal(self.similarity, -np.inf)
+
+    def usable(self) -> list[int]:
+        """Numbers of the scans that can be registered."""
+        return [k for k in range(len(self.scans)) if k not in self.unusable]
+
+    # ---- which pairs
+
+    def first_pairs(self, everything: bool, neighbors: int) -> list[PairKey]:
+        """Pairs to begin with: those known already, and all, or the most similar ones of every scan."""
+        usable = self.usable()
+        known = self._known()
+        if everything:
+            return sorted({(i, j) for j in usable for i in usable if i < j})
+        settled = {scan for pair in known for scan in pair}
+        wanted = set(known)
+        for scan in usable:
+            for other in self._most_similar(scan, usable, neighbors):
+                if scan not in settled or other not in settled:
+                    wanted.add(_key(scan, other))
+        return sorted(wanted)
+
+    def further_pairs(self, groups: list[Group], neighbors: int, *, closing: bool) -> list[PairKey]:
+        """Pairs not tried yet that could tie loose scans and groups, or, if wanted, close loops."""
+        more: set[PairKey] = set()
+        largest = set(groups[0].poses)
+        for group in groups:
+            if set(group.poses) == largest or not set(group.poses) <= set(self.usable()):
+                continue
+            outside = [k for k in self.usable() if k not in group.poses]
+            for scan in group.poses:
+                untried = [k for k in outside if _key(scan, k) not in self.outcomes]
+                more |= {_key(scan, other) for other in self._most_similar(scan, untried, neighbors)}
+        for group in groups if closing else []:
+            more |= self._closing_pairs(group)
+        return sorted(more)
+
+    def _closing_pairs(self, group: Group) -> set[PairKey]:
+        """Of every scan, the untried pairs that the poses say to overlap most."""
+        chosen: set[PairKey] = set()
+        scans = sorted(group.poses)
+        for j in scans:
+            found = []
+            for i in scans:
+                if i < j and (i, j) not in self.outcomes:
+                    overlap = self.overlaps.of(j, i, predicted_motion(j, i, group.poses))
+                    if overlap > _CLOSING_OVERLAP:
+                        found.append((-overlap, i))
+            chosen |= {(i, j) for _, i in sorted(found)[:_CLOSING_PER_SCAN]}
+        return chosen
+
+    def _most_similar(self, scan: int, others: Iterable[int], count: int) -> list[int]:
+        ranked = sorted((k for k in others if k != scan), key=lambda k: (-self.similarity[scan, k], k))
+        return ranked[:count]
+
+    def _known(self) -> set[PairKey]:
+        """Pairs in the journal whose scans and files are the same today."""
+        number = {self._row((i, j)).id: (i, j) for j in self.usable() for i in self.usable() if i < j}
+        known = set()
+        for record in read_journal(self.store.folder / "journal.jsonl"):
+            pair = number.get(str(record.get("id")))
+            if pair is not None and record.get("fingerprint") == self._row(pair).fingerprint():
+                known.add(pair)
+        return known
+
+    def _ends(self, pair: PairKey) -> tuple[int, int]:
+        """Source and target of a pair: by name, whatever the order in which scans are given."""
+        a, b = sorted(pair, key=lambda k: (natural_key(self.scans[k].name), self.scans[k].path))
+        return b, a
+
+    def _row(self, pair: PairKey) -> PairRow:
+        source, target = (self.scans[k] for k in self._ends(pair))
+        return PairRow(f"{source.name}+{target.name}", source.path, target.path)
+
+    # ---- registering and grouping
+
+    def register(self, pairs: list[PairKey]) -> None:
+        """Register what is missing of the pairs."""
+        rows = {pair: self._row(pair) for pair in pairs if pair not in self.outcomes}
+        if not rows:
+            return
+        records, _ = work(
+            list(rows.values()), self.store, self.config, self.labour, progress=self.progress, say=self.say
+        )
+        for pair, row in rows.items():
+            outcome = self.store.outcome(records[row.id])
+            self.outcomes[pair] = outcome
+            edge = edge_of(outcome, *self._ends(pair), self.shapes)
+            if edge is not None:
+                self.edges[pair] = edge
+
+    def group(self) -> list[Group]:
+        """Groups by all edges so far; a scan that cannot be used is a group of its own.
+
+        What settling lets go may find its place among scans that are better aligned now, so groups are joined
+        and settled again while that joins any.
+        """
+        edges = [self.edges[key] for key in sorted(self.edges)]
+        groups: list[Group] | None = None
+        for _ in range(_MOST_SETTLINGS):
+            known = groups
+            groups = group_scans(self.shapes, edges, self.rules, self.outcomes.keys(), self.overlaps, known)
+            if known is not None and len(groups) == len(known):
+                break
+            groups = [part for group in groups for part in self.settle(group, edges)]
+        return sorted(groups or [], key=lambda group: (-len(group.poses), min(group.poses)))
+
+    def settle(self, group: Group, edges: list[Edge]) -> list[Group]:
+        """The group, or what is left of it, aligned and held by edges that agree closely."""
+        return settle(group, edges, self.shapes, self.rules, self.align)
+
+    def align(self, poses: dict[int, FloatArray]) -> dict[int, FloatArray]:
+        """The poses of a group laid on each other by the scans' surfaces; once, however often asked."""
+        key = tuple((scan, poses[scan].tobytes()) for scan in sorted(poses))
+        if key not in self.aligned:
+            self.aligned[key] = align_scans(
+                poses, self.surfaces, self.overlaps, self.voxel_size, seed=self.config.seed
+            )
+        return dict(self.aligned[key])
+
+
+def _key(a: int, b: int) -> PairKey:
+    return (a, b) if a < b else (b, a)

@@ -28,7 +28,7 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.errors import EmptyCloudError, InputError
+from geomoe3d.errors import ConfigError, EmptyCloudError, InputError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import solve
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
@@ -155,6 +155,11 @@ class Registrar:
     ) -> Explanation:
         """`register` with the correspondences and weights behind the answer."""
         config, seed, clock = self.config, self.config.seed, StageClock(progress)
+        if initial is not None and not config.verification.enabled:
+            raise ConfigError(
+                "verification weighs a first guess against the hypotheses, but verification.enabled is "
+                "false; leave one of the two out"
+            )
         clock("load")
         clouds = _load(source, "source", seed), _load(target, "target", seed)
         for cloud in clouds:
@@ -322,7 +327,7 @@ def register(
 
     Raises:
         InputError: a cloud that cannot be read or has too few usable points, or a guess that is no motion.
-        ConfigError: an unknown or invalid override.
+        ConfigError: an unknown or invalid override, or a guess where verification is switched off.
     """
     if overrides:
         tree = (config or RegistrationConfig()).model_dump()

@@ -59,8 +59,9 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     """``[function(item) for item in items]``, several at a time where there are threads for it.
 
     Results are in order, and the first item's exception in order is raised, as in a loop; but all items are
-    begun. One inside another is a plain loop, and BLAS keeps to one thread. Worth it from about a millisecond
-    per item, spent outside the interpreter (numpy, torch).
+    begun. One inside another is a plain loop. With several threads BLAS keeps to one; in a plain loop it
+    does as the caller said, so products that must not vary by a bit belong inside `single_blas_thread`.
+    Worth it from about a millisecond per item, spent outside the interpreter (numpy, torch).
     """
     todo = list(items)
     usable = 1 if getattr(_inside, "busy", False) else usable_threads()

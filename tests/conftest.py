@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,3 +72,15 @@ def posed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from posed_scans import write_posed
 
     return write_posed(tmp_path_factory.mktemp("posed"))
+
+
+@pytest.fixture(scope="module")
+def own_cache(tmp_path_factory):
+    """A cache of described clouds of the test file's own."""
+    kept = os.environ.get("GEOMOE3D_CACHE")
+    os.environ["GEOMOE3D_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    if kept is None:
+        del os.environ["GEOMOE3D_CACHE"]
+    else:
+        os.environ["GEOMOE3D_CACHE"] = kept

@@ -77,3 +77,18 @@ def test_no_motions_are_no_channels() -> None:
     rows, _ = scene()
     assert aligned(rows, np.zeros((0, 4, 4))).shape == (0, 300, len(CHANNELS))
     assert MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)(np.zeros((0, 4, 4))) == []
+
+
+@pytest.mark.parametrize("count", [300, 1700])
+def test_the_share_that_preserves_length_counts_others_alone(count: int) -> None:
+    rows, T = scene(count=count)
+    found = column(aligned(rows, T[None])[0], "degree")
+    unit = (rows - rows.mean(0)) / VOXEL
+    anchors = np.arange(0, count, -(-count // 1000))  # beyond a thousand every second or third stands for all
+    gap = np.abs(
+        np.linalg.norm(unit[:, None, :3] - unit[None, anchors, :3], axis=2)
+        - np.linalg.norm(unit[:, None, 3:] - unit[None, anchors, 3:], axis=2)
+    )
+    agrees = (gap < 2.0) & (np.arange(count)[:, None] != anchors)
+    np.testing.assert_allclose(found, 5 * agrees.sum(1) / len(anchors), atol=0.02)
+    assert found.min() >= 0

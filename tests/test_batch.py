@@ -32,16 +32,7 @@ OPTIONS = [part for setting in SETTINGS for part in ("--set", setting)]
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache of described clouds of this file's own."""
-    kept = os.environ.get("GEOMOE3D_CACHE")
-    os.environ["GEOMOE3D_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    if kept is None:
-        del os.environ["GEOMOE3D_CACHE"]
-    else:
-        os.environ["GEOMOE3D_CACHE"] = kept
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(scope="module")
@@ -258,8 +249,11 @@ def test_two_batches_in_one_folder_are_refused(scans, finished):
     _, out = finished
     from geomoe3d.journal import Journal
 
-    with Journal(out / JOURNAL_FILE), pytest.raises(OutputError, match="another process"):
-        register_pairs(scans[0] / "pairs.csv", out, config=CONFIG)
+    before = (out / JOURNAL_FILE).read_bytes()
+    for fresh in (False, True):  # beginning anew must not pull the journal from under the other's feet
+        with Journal(out / JOURNAL_FILE), pytest.raises(OutputError, match="another process"):
+            register_pairs(scans[0] / "pairs.csv", out, config=CONFIG, fresh=fresh)
+    assert (out / JOURNAL_FILE).read_bytes() == before
 
 
 # ---- workers that die --------------------------------------------------------------------------------

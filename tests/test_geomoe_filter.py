@@ -124,6 +124,13 @@ def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
         save(tmp_path)
 
 
+def test_weights_and_card_are_written_both_or_neither(tmp_path: Path) -> None:
+    (tmp_path / "w.json").write_text("precious")
+    with pytest.raises(OutputError, match=r"w.json' exists"):
+        save(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["w.json"]
+
+
 def edit_card(path: Path, **changes: object) -> None:
     card = path.with_suffix(".json")
     card.write_text(json.dumps({**json.loads(card.read_text()), **changes}))

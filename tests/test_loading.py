@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from geomoe3d.clouds.io import READABLE_SUFFIXES, WRITABLE_SUFFIXES, load_points, save_points
 from geomoe3d.errors import DependencyError, EmptyCloudError, GeoMoE3DError, InputError, NonFiniteError
+from geomoe3d.types import PointCloud
 
 # --- loaded clouds -------------------------------------------------------------------------------------
 
@@ -23,6 +24,24 @@ def test_a_loaded_cloud_is_returned_as_it_is() -> None:
     assert load_points(given_cloud) is given_cloud
     renamed = load_points(given_cloud, name="b")
     assert renamed.name == "b" and renamed.points is given_cloud.points
+
+
+def test_a_cloud_made_by_hand_is_brought_into_form() -> None:
+    points = cloud(50)
+    points[3, 1] = np.nan
+    normals = unit_vectors(50)
+    made = load_points(PointCloud(points.astype(np.float32)[::-1], normals=normals, origin=np.ones(3)))
+    assert made.points.dtype == np.float64 and made.points.flags.c_contiguous
+    assert len(made.points) == len(made.normals) == 49
+    assert made.num_non_finite == 1
+    np.testing.assert_array_equal(made.origin, np.ones(3))
+    np.testing.assert_array_equal(made.points, np.delete(points.astype(np.float32)[::-1], 46, axis=0))
+    with pytest.raises(NonFiniteError, match="'cloud': all 4 points"):
+        load_points(PointCloud(np.full((4, 3), np.nan)))
+    with pytest.raises(InputError, match="normals have shape"):
+        load_points(PointCloud(cloud(50), normals=normals[:7]))
+    with pytest.raises(InputError, match="shape"):
+        load_points(PointCloud(cloud(50)[:, :2]))
 
 
 def test_names(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -26,16 +25,7 @@ from geomoe3d.multiway.page import render_model_page
 CONFIG = load_config(None, SETTINGS)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache of described clouds of this file's own."""
-    kept = os.environ.get("GEOMOE3D_CACHE")
-    os.environ["GEOMOE3D_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    if kept is None:
-        del os.environ["GEOMOE3D_CACHE"]
-    else:
-        os.environ["GEOMOE3D_CACHE"] = kept
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(scope="module")
@@ -222,3 +212,40 @@ def test_files_of_the_users_beside_a_model_stay(scanned_room, tmp_path):
     assert (tmp_path / "grouping.txt").read_text() == "mine"
     assert (tmp_path / "group1.ply").is_file()
     assert not (tmp_path / "group7.ply").exists()
+
+
+def test_pairs_whose_names_read_alike_are_two_pairs(scanned_room, tmp_path):
+    folder, truth = scanned_room
+    made = tmp_path / "scans"
+    made.mkdir()
+    for number, name in enumerate(("a", "b+a", "c", "c+b")):  # c with b+a, and c+b with a: "c+b+a" both
+        (made / f"{name}.npy").write_bytes((folder / f"scan_{number}.npy").read_bytes())
+    told = []
+    model = register_scans(
+        [made],
+        tmp_path / "out",
+        config=CONFIG,
+        page=False,
+        workers=1,
+        progress=lambda done, total: told.append((done, total)),
+    )
+    journal = list(read_journal(tmp_path / "out" / "pairs" / JOURNAL_FILE))
+    assert len(journal) == model.num_pairs == 6
+    (group,) = model.groups
+    for number, name in enumerate(("a", "b+a", "c", "c+b")):
+        expected = inverse(truth["scan_0"]) @ truth[f"scan_{number}"]
+        assert rotation_error_deg(group.poses[name], expected) < 1.0, name
+    assert told == sorted(told)
+    assert told[-1] == (6, 6)
+
+
+def test_a_scan_of_the_same_stem_leaves_the_pairs_of_others(scanned_room, tmp_path):
+    folder, _ = scanned_room
+    for place, number in (("a/s.npy", 0), ("a/t.npy", 1), ("b/s.npy", 2)):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_bytes((folder / f"scan_{number}.npy").read_bytes())
+    out = tmp_path / "out"
+    register_scans([tmp_path / "a"], out, config=CONFIG, page=False, workers=1)
+    model = register_scans([tmp_path / "a", tmp_path / "b"], out, config=CONFIG, page=False, workers=1)
+    assert model.num_pairs == 3
+    assert len(list(read_journal(out / "pairs" / JOURNAL_FILE))) == 3

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.prepare import voxel_keys
 from geomoe3d.config import PreparationConfig
 from geomoe3d.multiway.scans import choose_common_voxel_size, find_scans
 
@@ -21,3 +25,15 @@ def test_the_common_voxel_size_serves_the_median_scan(scanned_room):
     assert list(unusable) == ["scan_9"]
     assert 0.1 < size < 0.6
     assert float(f"{size:.2g}") == size
+
+
+def test_no_scan_exceeds_the_limit_of_voxels_on_the_common_grid(tmp_path):
+    rng = np.random.default_rng(0)
+    for number, side in enumerate((2.0, 2.0, 2.0, 40.0)):  # three small plates and a huge one
+        plate = np.column_stack([rng.uniform(0, side, (60_000, 2)), np.zeros(60_000)])
+        np.save(tmp_path / f"{number}.npy", plate)
+    for limit in range(1000, 1400, 25):
+        config = PreparationConfig(voxel_points=1000, max_points=limit)
+        size, _ = choose_common_voxel_size(find_scans([tmp_path]), config)
+        largest = load_points(tmp_path / "3.npy").points
+        assert len(np.unique(voxel_keys(largest, size))) <= limit

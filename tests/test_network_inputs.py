@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from geomoe3d.errors import InputError, NonFiniteError
+from geomoe3d.config import build_config
+from geomoe3d.errors import ConfigError, InputError, NonFiniteError
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.compatibility import compatibility_inputs
 from geomoe3d.filters.geomoe import GeoMoE
@@ -245,3 +246,8 @@ def test_collate_pads_and_keeps_every_pair() -> None:
     assert torch.equal(batch.neighbors[1], pairs[1].neighbors)
     assert int(batch.neighbors[0, 5:].min()) >= 5
     assert collate(pairs[:1]).mask is None
+
+
+def test_more_anchors_than_the_fewest_correspondences_are_refused() -> None:
+    with pytest.raises(ConfigError, match="compatibility_anchors 512 exceeds compatibility_full 100"):
+        build_config(NetworkConfig, {"compatibility_full": 100})

@@ -301,3 +301,9 @@ def test_correspondences_are_bounded_however_many_points(pair):
     assert isinstance(explained.correspondences, Correspondences)
     assert len(explained.correspondences) == 300
     assert explained.correspondences.mutual.all() or explained.correspondences.mutual.sum() < 300
+
+
+def test_a_first_guess_without_verification_is_refused_before_work(pair):
+    config = load_config(None, ["verification.enabled=false"])
+    with pytest.raises(ConfigError, match=r"verification\.enabled is false"):
+        geomoe3d.register(pair[0], pair[1], config=config, initial=np.eye(4))

@@ -12,7 +12,7 @@ from cloud_files import UTM, cloud, rigid, small_cloud, unit_vectors
 from geomoe3d.clouds.io import (
     WRITABLE_MESH_SUFFIXES,
     WRITABLE_SUFFIXES,
-    check_output,
+    check_cloud_output,
     load_points,
     save_aligned,
     save_points,
@@ -134,7 +134,7 @@ def test_an_existing_file_is_kept_without_force(tmp_path: Path) -> None:
     for save in (
         lambda: save_points(path, small_cloud()),
         lambda: save_aligned(path, small_cloud(), np.eye(4)),
-        lambda: check_output(path, False, WRITABLE_SUFFIXES),
+        lambda: check_cloud_output(path, False, WRITABLE_SUFFIXES),
     ):
         with pytest.raises(OutputError, match=r"--force \(force=True"):
             save()
@@ -188,27 +188,30 @@ def test_links_are_followed_and_modes_are_ordinary(tmp_path: Path) -> None:
 
 
 def test_output_places_that_do_not_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert check_output(str(tmp_path / "a.PLY"), False, WRITABLE_SUFFIXES) == tmp_path / "a.PLY"
+    assert check_cloud_output(str(tmp_path / "a.PLY"), False, WRITABLE_SUFFIXES) == tmp_path / "a.PLY"
     (tmp_path / "folder.ply").mkdir()
     for path, error, word in (
-        (tmp_path / "none" / "a.ply", OutputError, "no folder"),
-        (tmp_path / "folder.ply", OutputError, "is a directory"),
+        (tmp_path / "none" / "a.ply", OutputError, "does not exist"),
+        (tmp_path / "folder.ply", OutputError, "it is a folder"),
         (tmp_path / "a.plyy", FormatError, "did you mean .ply?"),
         (tmp_path / "a.e57", FormatError, ", ".join(WRITABLE_SUFFIXES)),
         (tmp_path / "a", FormatError, "no suffix"),
     ):
         for call in (
-            lambda p: check_output(p, True, WRITABLE_SUFFIXES),
+            lambda p: check_cloud_output(p, True, WRITABLE_SUFFIXES),
             lambda p: save_points(p, small_cloud()),
             lambda p: save_aligned(p, small_cloud(), np.eye(4)),
         ):
             with pytest.raises(error, match=word.replace("?", r"\?").replace(".", r"\.")[:60]):
                 call(path)
+    (tmp_path / "loop.ply").symlink_to(tmp_path / "loop.ply")
+    with pytest.raises(OutputError, match="loop"):
+        check_cloud_output(tmp_path / "loop.ply", True, WRITABLE_SUFFIXES)
     with pytest.raises(OutputError, match="too long"):
-        check_output(tmp_path / ("a" * 300 + ".ply"), True, WRITABLE_SUFFIXES)
+        check_cloud_output(tmp_path / ("a" * 300 + ".ply"), True, WRITABLE_SUFFIXES)
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
-    with pytest.raises(OutputError, match="may not be written"):
-        check_output(tmp_path / "a.ply", True, WRITABLE_SUFFIXES)
+    with pytest.raises(OutputError, match="no right to write"):
+        check_cloud_output(tmp_path / "a.ply", True, WRITABLE_SUFFIXES)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

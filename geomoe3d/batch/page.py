@@ -60,6 +60,7 @@ def save_batch_page(path: Path, rows: Sequence[PairRow], outcomes: Sequence[Outc
     Raises:
         OutputError: the page cannot be written.
     """
+    _points.cache_clear()  # files may have changed since the last page of this process
     text = render_batch_page(rows, outcomes)
     write_atomically(path, lambda temporary: _put(temporary, text), force=True)
 

@@ -14,7 +14,7 @@ from geomoe3d.batch.store import BatchStore, Outcome, remove_batch
 from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
 from geomoe3d.batch.task import Settings, Task, as_record, register_pair
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.errors import InputError
+from geomoe3d.errors import InputError, OutputError
 from geomoe3d.filters.base import resolved
 from geomoe3d.transform_files import has_transform, save_transform
 from geomoe3d.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
@@ -183,7 +183,10 @@ def work(
 
 def write_transforms(folder: Path, outcomes: Iterable[Outcome]) -> None:
     """One text file per outcome that has a transform, named by its id (odd characters as %XX)."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
     for outcome in outcomes:
         result = outcome.result
         if result is not None and has_transform(result):

@@ -154,8 +154,10 @@ def remove_batch(folder: Path) -> None:
     """Delete what a batch keeps of itself; nothing else in the folder is touched.
 
     Raises:
-        OutputError: a file cannot be removed.
+        OutputError: a file cannot be removed, or another process is writing the journal.
     """
+    if (folder / JOURNAL_FILE).is_file():
+        Journal(folder / JOURNAL_FILE).close()  # refused while another process holds it
     for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE):
         try:
             (folder / name).unlink(missing_ok=True)

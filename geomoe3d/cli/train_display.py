@@ -111,12 +111,14 @@ class Display:
             f"skipped {skipped}"
         )
         table = Table(box=None, pad_edge=False)
+        names = list(self._validations[-1][1]) if self._validations else ["precision", "recall", "f1"]
         table.add_column("")
-        for name in ("precision", "recall", "f1", "registration recall"):
-            table.add_column(name, justify="right")
-        table.add_row("training", *(f"{self._means[n]:.3f}" for n in ("precision", "recall", "f1")), "")
+        for name in names:
+            table.add_column(name.replace("_", " "), justify="right")
+        known = [self._means.get(name) for name in names]
+        table.add_row("training", *("" if value is None else f"{value:.3f}" for value in known))
         for at, measures, best in self._validations[-5:]:
-            row = [f"{v:.3f}" for v in measures.values()]
+            row = [f"{measures[name]:.3f}" for name in names]
             table.add_row(f"validation {at}", *row, style="bold" if best else "")
         losses = "   ".join(f"{n} {self._means[n]:.4f}" for n in _SHOWN[:4])
         return Group(head, ProgressBar(total=self._steps, completed=step, width=60), Text(losses), table)

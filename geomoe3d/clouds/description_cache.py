@@ -30,7 +30,13 @@ from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
 DEFAULT_MAX_BYTES = 4 * 2**30
 _SUFFIX = ".described.npz"
-_DECIDING_FILES = ("description_cache.py", "prepare.py", "viewpoint.py", "features.py")
+_DECIDING_FILES = (
+    "clouds/description_cache.py",
+    "clouds/prepare.py",
+    "clouds/viewpoint.py",
+    "clouds/features.py",
+    "geometry/columns.py",
+)
 _DECIDING_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "open3d")
 _ABANDONED_SECONDS = 3600.0
 _COUNTS = ("num_input", "num_non_finite", "num_duplicates", "num_isolated")
@@ -144,7 +150,7 @@ def _code() -> str:
     """Hash of the files and versions of the libraries that make a description."""
     digest = hashlib.sha256()
     for name in _DECIDING_FILES:
-        digest.update(Path(__file__).with_name(name).read_bytes())
+        digest.update((Path(__file__).parents[1] / name).read_bytes())
     for name in _DECIDING_LIBRARIES:
         try:
             digest.update(f"{name}=={version(name)}".encode())

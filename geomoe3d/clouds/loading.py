@@ -62,7 +62,8 @@ def load_points(
     Args:
         data: a path (str or Path); an array-like of shape (N, 3), floats or integers of any size; a torch
             tensor; an Open3D PointCloud or TriangleMesh (legacy or tensor); a trimesh mesh, cloud or scene;
-            or a PointCloud, which is returned as it is.
+            or a PointCloud, whose origin is kept: as it is, if its points are finite float64 in one piece of
+            memory, else a copy that is.
         seed: decides the points sampled on a mesh.
         mesh_points: points sampled on a mesh, at least 1.
         name: what to call the cloud in messages; None takes the file name, or "cloud" for data in memory.
@@ -79,7 +80,7 @@ def load_points(
         DependencyError: the format's optional library is not installed.
     """
     if isinstance(data, PointCloud):
-        return data if name is None else replace(data, name=name)
+        return _checked(data if name is None else replace(data, name=name))
     if mesh_points < 1:
         raise InputError(f"mesh_points is {mesh_points}, expected at least 1")
     raw = read_raw(data)
@@ -97,6 +98,28 @@ def load_points(
         colors=cloud.colors,
         name=label,
         num_non_finite=num_non_finite,
+    )
+
+
+def _checked(cloud: PointCloud) -> PointCloud:
+    """The cloud itself, or a copy with what all that follows relies on: finite float64 rows without gaps.
+
+    Raises:
+        InputError, EmptyCloudError, NonFiniteError: as `load_points`.
+    """
+    what, points = f"'{cloud.name}'", cloud.points
+    whole = isinstance(points, np.ndarray) and points.dtype == np.float64 and points.flags.c_contiguous
+    if not (whole and points.ndim == 2 and points.shape[1] == 3):
+        points = objects.raw_from_object(points).points
+    for name, values in (("normals", cloud.normals), ("colors", cloud.colors)):
+        if values is not None and np.shape(values) != points.shape:
+            raise InputError(f"{what}: {name} have shape {np.shape(values)}, expected {points.shape}")
+    raw, num_non_finite = finite_part(RawCloud(points, cloud.normals, cloud.colors), what)
+    if raw.points is cloud.points:
+        return cloud
+    num_non_finite += cloud.num_non_finite
+    return replace(
+        cloud, points=raw.points, normals=raw.normals, colors=raw.colors, num_non_finite=num_non_finite
     )
 
 

@@ -46,10 +46,9 @@ def match(
     """
     if source.features is None or target.features is None:
         raise InputError("match needs described clouds; call describe(cloud, config) on both first")
-    with single_blas_thread():
-        index, distance, ratio, mutual = nearest_features(
-            source.features, target.features, config.neighbors, with_ratio or config.method == "ratio"
-        )
+    index, distance, ratio, mutual = nearest_features(
+        source.features, target.features, config.neighbors, with_ratio or config.method == "ratio"
+    )
     rows = np.repeat(np.arange(len(source)), index.shape[1])
     columns, mutual = index.ravel(), mutual.ravel()
     keep: BoolArray = np.ones(len(rows), dtype=np.bool_)
@@ -75,6 +74,7 @@ def match(
     return found.take(np.sort(shuffled[mutual_first[: config.max_correspondences]]))
 
 
+@single_blas_thread()
 def nearest_features(
     source: Float32Array, target: Float32Array, neighbors: int, with_ratio: bool = True
 ) -> tuple[IntArray, Float32Array, Float32Array | None, BoolArray]:

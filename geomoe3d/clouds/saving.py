@@ -20,8 +20,8 @@ from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.errors import FormatError, InputError, NonFiniteError, OutputError
-from geomoe3d.files import write_atomically
+from geomoe3d.errors import FormatError, InputError, NonFiniteError
+from geomoe3d.files import check_output, write_atomically
 from geomoe3d.types import FloatArray
 
 _CLOUD_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
@@ -45,8 +45,8 @@ WRITABLE_SUFFIXES = tuple(_CLOUD_WRITERS)
 WRITABLE_MESH_SUFFIXES = (*_MESH_WRITERS, ".glb")
 
 
-def check_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str, ...]) -> Path:
-    """Find out before work begins whether a file can be written.
+def check_cloud_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str, ...]) -> Path:
+    """Find out before work begins whether a cloud can be written: `geomoe3d.files.check_output` and a suffix.
 
     Args:
         path: the file to be written.
@@ -54,35 +54,15 @@ def check_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str,
         suffixes: allowed suffixes, lower case with dot; case does not matter in ``path``.
 
     Returns:
-        The path.
+        The path, links followed.
 
     Raises:
         FormatError: another suffix; the message lists ``suffixes``.
-        OutputError: the file exists without ``force``, is a directory, its folder is missing, or the folder
-            may not be written to.
+        OutputError: as `geomoe3d.files.check_output`.
     """
-    path = Path(path)
-    try:
-        _check_place(path, force, suffixes)
-    except OutputError:
-        raise
-    except OSError as error:  # a name too long, a folder on the way that may not be searched
-        raise OutputError(f"cannot write '{path}': {error.strerror or error}") from None
-    return path
-
-
-def _check_place(path: Path, force: bool, suffixes: tuple[str, ...]) -> None:
-    if path.is_dir():
-        raise OutputError(f"'{path}' is a directory; name a file in it")
-    if path.suffix.lower() not in suffixes:
-        raise FormatError(unknown_suffix(path, suffixes, "writable"))
-    folder = path.resolve().parent
-    if not folder.is_dir():
-        raise OutputError(f"cannot write '{path}': there is no folder '{folder}'; create it first")
-    if path.exists() and not force:
-        raise OutputError(f"'{path}' exists; pass --force (force=True in Python) to replace it")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f"cannot write '{path}': the folder '{folder}' may not be written to")
+    if Path(path).suffix.lower() not in suffixes:
+        raise FormatError(unknown_suffix(Path(path), suffixes, "writable"))
+    return check_output(path, force=force)
 
 
 def _write(path: Path, fill: Callable[[BinaryIO], None], force: bool) -> None:
@@ -122,9 +102,9 @@ def save_points(
         InputError: an array of another shape or type, or colours beyond [0, 1]; EmptyCloudError for no
             points, NonFiniteError for NaN or infinities.
         FormatError: an unknown suffix, or normals or colours for NPY, which cannot name them.
-        OutputError: as `check_output`, or the disk refuses.
+        OutputError: as `check_cloud_output`, or the disk refuses.
     """
-    path = check_output(path, force, WRITABLE_SUFFIXES)
+    path = check_cloud_output(path, force, WRITABLE_SUFFIXES)
     cloud = RawCloud(
         points_array(points),
         None if normals is None else points_array(normals, "the normals"),
@@ -167,11 +147,11 @@ def save_aligned(
     Raises:
         InputError: no rigid motion, or a source that cannot be used (as `load_points`).
         FormatError: a suffix that cannot be written, or a mesh suffix for a cloud.
-        OutputError: as `check_output`, or the disk refuses.
+        OutputError: as `check_cloud_output`, or the disk refuses.
     """
     T = _rigid(T_target_source)
     both = tuple(dict.fromkeys(WRITABLE_SUFFIXES + WRITABLE_MESH_SUFFIXES))
-    path = check_output(path, force, both)
+    path = check_cloud_output(path, force, both)
     suffix = path.suffix.lower()
     what = describe(source)
     raw, _ = finite_part(read_raw(source), what)

@@ -10,14 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +28,7 @@ from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.files import write_atomically
+from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 MANIFEST = "manifest.json"
 _WRITING = ".writing-"
@@ -241,37 +239,12 @@ def _timed_scene(job: Job, number: int) -> float:
 
 def _run(job: Job, todo: list[int], workers: int) -> Iterator[float]:
     """Processor seconds of each scene as it is done."""
-    if workers == 1:
-        for number in todo:
-            yield _timed_scene(job, number)
-        return
-    # One thread per process: Open3D reads this when it is imported.
-    kept = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    waiting: set[Future[float]] = set()
-    rest = iter(todo)
-    try:
-        while True:
-            for number in rest:
-                waiting.add(pool.submit(_timed_scene, job, number))
-                if len(waiting) >= 2 * workers:
-                    break
-            if not waiting:
-                return
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
-    except BrokenProcessPool:
-        raise OutputError(
-            "a worker died, perhaps for lack of memory; the same command goes on, with fewer --workers"
-        ) from None
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        if kept is None:
-            os.environ.pop("OMP_NUM_THREADS", None)
-        else:
-            os.environ["OMP_NUM_THREADS"] = kept
+    pool = SerialPool() if workers == 1 else ProcessPool(workers)
+    for number, made in run_surviving(pool, partial(_timed_scene, job), todo):
+        if isinstance(made, WorkerDied):
+            advice = "the same command goes on, with fewer --workers"
+            raise OutputError(f"scene {number}: {made.reason}; {advice}")
+        yield made
 
 
 def _manifest(job: Job) -> dict[str, Any]:

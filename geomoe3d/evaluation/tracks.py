@@ -80,7 +80,8 @@ class InputMaker:
             files = {self._published / f"{pair.scene}.npz" for pair in pairs}
             return {"from": "published 1k correspondences", "files_sha256": _hash_files(files)}
         package = Path(geomoe3d.__file__).parent
-        code = {package / "data" / "describe.py", *(package / "clouds").glob("*.py")}
+        code = {package / "data" / "describe.py", package / "data" / "collection.py"}
+        code |= {file for part in ("clouds", "geometry") for file in (package / part).rglob("*.py")}
         return {
             "from": "matched on a 5 cm grid",
             "files_sha256": _hash_files(files),

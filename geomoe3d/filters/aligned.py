@@ -127,18 +127,19 @@ class AlignedChannels:
 def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
     """Parts of (N,): 5 x the share of at most 1,000 correspondences with which each one preserves length."""
     unit = (rows - rows.mean(0)).astype(np.float32)
-    anchors = unit[:: -(-len(unit) // _MOST_ANCHORS)]
+    step = -(-len(unit) // _MOST_ANCHORS)
+    anchors = unit[::step]
 
-    def part(some: Float32Array) -> Float32Array:
+    def part(start: int) -> Float32Array:
+        some = unit[start : start + _ROWS_AT_ONCE]
+        itself = np.arange(start, start + len(some)) % step == 0  # only an anchor meets itself
         gap = distances(some[:, :3], anchors[:, :3])
         gap -= distances(some[:, 3:], anchors[:, 3:])
         compatible = np.abs(gap, out=gap) < 1.0
-        share: Float32Array = (5 * (compatible.sum(1) - 1) / len(anchors)).astype(np.float32)
+        share: Float32Array = (5 * (compatible.sum(1) - itself) / len(anchors)).astype(np.float32)
         return share
 
-    return [
-        partial(part, unit[start : start + _ROWS_AT_ONCE]) for start in range(0, len(unit), _ROWS_AT_ONCE)
-    ]
+    return [partial(part, start) for start in range(0, len(unit), _ROWS_AT_ONCE)]
 
 
 def _kernel(square: FloatArray) -> FloatArray:

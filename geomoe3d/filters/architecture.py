@@ -89,6 +89,11 @@ class NetworkConfig(Section):
             raise ValueError("the channels 'aligned' stand alone: no other extra channel, motion_form none")
         if self.judges_motions and (self.knn_space != "source" or self.correspondence_dim != 6):
             raise ValueError("the channels 'aligned' need knn_space source and correspondence_dim 6")
+        if self.compatibility_anchors > self.compatibility_full:
+            raise ValueError(
+                f"compatibility_anchors {self.compatibility_anchors} exceeds compatibility_full "
+                f"{self.compatibility_full}: there would be fewer correspondences than anchors"
+            )
         if self.correspondence_dim == 4 and self.needs_compatibility:
             raise ValueError("length compatibility holds between 3D points; correspondence_dim is 4")
         return self

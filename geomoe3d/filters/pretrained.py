@@ -14,7 +14,7 @@ from typing import Any
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, ConfigError
-from geomoe3d.files import write_atomically
+from geomoe3d.files import check_output, write_atomically
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.weight_files import find_weights
@@ -80,6 +80,8 @@ def save_pretrained(
         if lost:
             raise CheckpointError(f"'{lost[0]}' does not fit half precision; save in single precision")
     data = save(tensors)
+    for file in (path, card_path(path)):  # both or neither
+        check_output(file, force=force)
     write_atomically(path, lambda temporary: _write(temporary, data), force=force)
     values = asdict(card)
     values["architecture"] = model.config.model_dump(mode="json")
@@ -104,7 +106,10 @@ def load_pretrained(name_or_path: str | Path) -> tuple[GeoMoE, WeightCard]:
 
     path = find_weights(name_or_path)
     card = read_card(path)
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"cannot read '{path}': {error.strerror or error}") from None
     digest = hashlib.sha256(data).hexdigest()
     if digest != card.sha256:
         raise CheckpointError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,8 +110,7 @@ def register_scans(
         from geomoe3d.multiway.page import save_model_page
 
         save_model_page(model, folder / "page.html")
-    object.__setattr__(model, "seconds", clock.stop())
-    return model
+    return replace(model, seconds=clock.stop())
 
 
 def _with_voxel_size(

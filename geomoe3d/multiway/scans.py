@@ -83,12 +83,18 @@ def choose_common_voxel_size(
     if len(sizes) < 2:
         listed = "; ".join(f"{name}: {reason}" for name, reason in unusable.items())
         raise InputError(f"fewer than 2 scans can be used: {listed}")
-    common = float(np.median(list(sizes.values())))
+    wanted = common = float(f"{np.median(list(sizes.values())):.2g}")
     for path, size in sizes.items():
         if size > 2 * common:  # only such a scan can occupy too many voxels
             cloud = load_points(path)
             common = bounded_voxel_size(cloud, cloud, common, config.max_points)
-    return float(f"{common:.2g}"), unusable
+    return (common if common == wanted else _rounded_up(common)), unusable
+
+
+def _rounded_up(size: float) -> float:
+    """To two digits, never down: a size raised to a limit of voxels must not fall below it again."""
+    digits = float(f"{size:.2g}")
+    return digits if digits >= size else float(f"{size * 1.05:.2g}")
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from geomoe3d.batch.run import Labour, work
-from geomoe3d.batch.store import BatchStore, Outcome
+from geomoe3d.batch.store import JOURNAL_FILE, BatchStore, Outcome
 from geomoe3d.batch.table import PairRow
 from geomoe3d.batch.task import open_cache
 from geomoe3d.clouds.io import load_points
@@ -151,7 +152,7 @@ class Survey:
         """Pairs in the journal whose scans and files are the same today."""
         number = {self._row((i, j)).id: (i, j) for j in self.usable() for i in self.usable() if i < j}
         known = set()
-        for record in read_journal(self.store.folder / "journal.jsonl"):
+        for record in read_journal(self.store.folder / JOURNAL_FILE):
             pair = number.get(str(record.get("id")))
             if pair is not None and record.get("fingerprint") == self._row(pair).fingerprint():
                 known.add(pair)
@@ -163,8 +164,9 @@ class Survey:
         return b, a
 
     def _row(self, pair: PairKey) -> PairRow:
-        source, target = (self.scans[k] for k in self._ends(pair))
-        return PairRow(f"{source.name}+{target.name}", source.path, target.path)
+        source, target = (self.scans[k].path for k in self._ends(pair))
+        # Paths, not names: two pairs may have one name between them, and names grow as scans join.
+        return PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
 
     # ---- registering and grouping
 
@@ -174,7 +176,7 @@ class Survey:
         if not rows:
             return
         records, _ = work(
-            list(rows.values()), self.store, self.config, self.labour, progress=self.progress, say=self.say
+            list(rows.values()), self.store, self.config, self.labour, progress=self._count(), say=self.say
         )
         for pair, row in rows.items():
             outcome = self.store.outcome(records[row.id])
@@ -182,6 +184,13 @@ class Survey:
             edge = edge_of(outcome, *self._ends(pair), self.shapes)
             if edge is not None:
                 self.edges[pair] = edge
+
+    def _count(self) -> Callable[[int, int], None] | None:
+        """Progress of one round, told as that of all pairs so far proposed."""
+        tell, before = self.progress, len(self.outcomes)
+        if tell is None:
+            return None
+        return lambda done, total: tell(before + done, before + total)
 
     def group(self) -> list[Group]:
         """Groups by all edges so far; a scan that cannot be used is a group of its own.

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from geomoe3d.batch.run import register_pairs
     from geomoe3d.clouds.io import load_points, save_points
     from geomoe3d.config import RegistrationConfig, load_config
+    from geomoe3d.correspondence_solver import CorrespondenceResult, register_correspondences
     from geomoe3d.errors import (
         CheckpointError,
         ConfigError,
@@ -39,6 +40,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CheckpointError",
     "ConfigError",
+    "CorrespondenceResult",
     "Correspondences",
     "DependencyError",
     "EmptyCloudError",
@@ -55,6 +57,7 @@ __all__ = [
     "load_config",
     "load_points",
     "register",
+    "register_correspondences",
     "register_pairs",
     "register_scans",
     "save_points",
@@ -63,6 +66,8 @@ __all__ = [
 _HOME = {
     "Registrar": "registration",
     "register": "registration",
+    "register_correspondences": "correspondence_solver",
+    "CorrespondenceResult": "correspondence_solver",
     "register_pairs": "batch.run",
     "register_scans": "multiway.run",
     "RegistrationResult": "result",

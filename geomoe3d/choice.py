@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.answer import Findings
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.geometry.se3 import check_motion, residuals, shift_frames
+from geomoe3d.geometry.se3 import (
+    check_motion,
+    residuals,
+    rotation_angle_deg,
+    shift_frames,
+    transform_points,
+)
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import Refiner
 from geomoe3d.stages import StageClock
@@ -72,6 +78,7 @@ class Chooser:
         self._refiner = Refiner(*described, config.refinement)
         self._ranked: list[tuple[Hypothesis, Evidence]] = []
         self._first: Hypothesis | None = None
+        self._guess: FloatArray | None = None
         self._refined: dict[bytes, Refined] = {}
         self._judged: dict[bytes, Judged] = {}
 
@@ -87,6 +94,7 @@ class Chooser:
         source, target = self._described
         T = shift_frames(check_motion(initial), -source.origin, -target.origin)
         refined, _ = self._refiner(T)
+        self._guess = refined
         self.consider([Hypothesis(motion, 0.0, 0) for motion in (T, refined)])
 
     def conclude(self, num_refined: int = 1, num_judged: int = 3) -> Findings:
@@ -111,7 +119,28 @@ class Chooser:
         judgement = judge(answer.evidence, lead, support, information, self._config.judgement, rival)
         weighed = None if answer.judged is None else answer.judged.output
         findings = Findings(T, other, lead, answer.evidence, information, judgement, weighed)
-        return findings if answer.note is None else findings.with_note(answer.note)
+        for note in (answer.note, self._overruled(T)):
+            findings = findings if note is None else findings.with_note(note)
+        return findings
+
+    def _overruled(self, T_target_source: FloatArray) -> str | None:
+        """A sentence where the answer is clearly another motion than the user's first guess, refined."""
+        if self._guess is None:
+            return None
+        guess, source = self._guess, self._described[0]
+        evidence = self._verifier.evidence(guess)
+        if (
+            clearly_different([(Hypothesis(guess, 0.0, 0), evidence)], T_target_source, source, self._shift)
+            is None
+        ):
+            return None
+        centre = source.points.mean(0)[None]
+        shift = np.linalg.norm(transform_points(guess, centre) - transform_points(T_target_source, centre))
+        turn = rotation_angle_deg(T_target_source[:3, :3].T @ guess[:3, :3])
+        return (
+            f"the first guess is not the answer: refined, it lies {turn:.1f} deg and {shift:.3g} away, where "
+            "the clouds fit less well"
+        )
 
     def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
         """Show the network the distinct hypotheses that the clouds like best, and whatever leads after that.

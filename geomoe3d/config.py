@@ -122,6 +122,12 @@ class SecondLookConfig(Section):
         description="so many of the best distinct hypotheses are shown to the network, if there is one",
     )
 
+    flip: bool = Field(
+        True,
+        description="where no sensor position is known, ask again with the source's normals turned over "
+        "whenever the answer is not ok",
+    )
+
     @field_validator("grids")
     @classmethod
     def _check(cls, grids: tuple[float, ...]) -> tuple[float, ...]:
@@ -259,6 +265,8 @@ def _explain(error: ValidationError, section: type[Section]) -> str:
         key = ".".join(str(part) for part in problem["loc"])
         if problem["type"] == "extra_forbidden":
             parts.append(f"unknown key '{key}'; {_nearest(key, known_keys(section))}")
+        elif problem["type"] in ("model_type", "model_attributes_type"):
+            parts.append(f"'{key}' is a section, found {problem['input']!r}; did you mean {key}.name?")
         else:
             parts.append(f"'{key}' = {problem['input']!r}: {problem['msg']}")
     return "; ".join(parts)

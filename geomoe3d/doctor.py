@@ -76,7 +76,7 @@ class Finding:
     Attributes:
         name: what was looked at.
         state: ok, missing or broken.
-        required: whether registration works without it.
+        required: whether registration needs it.
         detail: version, or what is wrong.
         mend: the command (or, where no command can, the step) that mends it; None when ok.
     """

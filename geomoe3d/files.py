@@ -1,8 +1,8 @@
 """Writing a file completely or not at all, and never over one that was there, unless told to.
 
 At the bottom of the import order: every writer of the package (clouds, pictures, pages, results, reports)
-goes through `write_atomically`. The bytes first go to a hidden neighbour in the same folder, so that a
-reader, a full disk or an interrupt never meets half a file.
+goes through `write_atomically`, texts through `write_text`. The bytes first go to a hidden neighbour in the
+same folder, so that a reader, a full disk or an interrupt never meets half a file.
 """
 
 from __future__ import annotations
@@ -82,6 +82,19 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], None]
         raise OutputError(f"cannot write '{path}': {_reason(error)}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str, *, force: bool) -> None:
+    """Create ``path`` with ``text`` in UTF-8; line ends stay as they are in it, on every system.
+
+    Raises:
+        OutputError: as `write_atomically`.
+    """
+
+    def write(temporary: Path) -> None:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+    write_atomically(path, write, force=force)
 
 
 def _move(temporary: Path, path: Path, *, force: bool) -> None:

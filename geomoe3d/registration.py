@@ -8,15 +8,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.answer import failed_result, finished_result
+from geomoe3d.answer import Findings, failed_result, finished_result
 from geomoe3d.choice import Chooser
 from geomoe3d.clouds.description_cache import DescriptionCache
-from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.features import describe, flip_normals
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.matching import match
 from geomoe3d.clouds.prepare import (
@@ -28,11 +28,13 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.errors import ConfigError, EmptyCloudError, InputError
+from geomoe3d.correspondence_solver import check_length, check_rows
+from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import solve
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
 from geomoe3d.judge import Judgement
+from geomoe3d.remarks import remarks
 from geomoe3d.result import RegistrationResult
 from geomoe3d.stages import Progress, StageClock
 from geomoe3d.threads import single_blas_thread
@@ -66,6 +68,15 @@ class Explanation:
     def weights(self) -> FloatArray:
         """(K,) the filter's weights."""
         return self.weighed.weights
+
+
+class _Look(NamedTuple):
+    """What a pair was seen as, and what was found in it."""
+
+    described: tuple[PreparedCloud, PreparedCloud]
+    matched: Correspondences
+    weighed: FilterOutput
+    findings: Findings
 
 
 class Registrar:
@@ -128,18 +139,16 @@ class Registrar:
     def filter(self, correspondences: ArrayLike, *, voxel_size: float) -> FloatArray:
         """Weights (N,) in [0, 1] for anybody's correspondences (N, 6) = [source xyz, target xyz].
 
-        A sensor is believed to have stood at zero where that lies within one extent of both halves.
+        A sensor is believed to have stood at zero where that can be, see `geomoe3d.clouds.viewpoint`.
 
         Args:
             correspondences: (N, 6) in one unit of length.
             voxel_size: the scale of the points' noise, same unit: the grid they came from.
 
         Raises:
-            InputError: wrong shape or non-finite numbers.
+            InputError: wrong shape, non-finite numbers, or no positive length.
         """
-        rows = np.asarray(correspondences, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] != 6 or not np.isfinite(rows).all():
-            raise InputError(f"correspondences must be finite numbers of shape (N, 6), found {rows.shape}")
+        rows, voxel_size = check_rows(correspondences), check_length(voxel_size, "voxel_size")
         zero = np.zeros(3)
         views = believed_viewpoints(rows, (zero, zero)) if len(rows) else None
         given = Correspondences(rows, viewpoints=views)
@@ -174,6 +183,38 @@ class Registrar:
         described = self.describe(*clouds, voxel_size, clock)
         # Known places, not guessed ones: the network was trained on true ones, or none.
         viewpoints = known_viewpoints(*clouds, config.preparation.viewpoint)
+        seen = self._look(described, viewpoints, initial, clock)
+        if viewpoints is None and self._asks_flipped(seen.findings.judgement):
+            clock("describe")
+            turned = flip_normals(described[0], config.preparation), replace(described[1], viewpoint=None)
+            other = self._look(turned, None, initial, clock, flipped=True)
+            if other.findings.judgement.confidence > seen.findings.judgement.confidence:
+                seen = other
+        described, matched, weighed, findings = seen
+        given = (source, target), described, wanted, viewpoints is not None
+        for remark in remarks(*given, config.preparation, findings.judgement):
+            findings = findings.with_note(remark)
+        if self._shows_motions:  # nothing weighs anything where no motion was found
+            weighed = findings.weighed or FilterOutput(np.zeros(len(matched)))
+        result = finished_result(described, matched, findings, config, threshold, clock.stop())
+        inliers = findings.residuals(matched) < threshold
+        return Explanation(result, *clouds, matched, weighed, inliers)
+
+    def _look(
+        self,
+        described: tuple[PreparedCloud, PreparedCloud],
+        viewpoints: tuple[FloatArray, FloatArray] | None,
+        initial: ArrayLike | None,
+        clock: StageClock,
+        *,
+        flipped: bool = False,
+    ) -> _Look:
+        """From described clouds to a judged answer; a doubtful one with hypotheses of coarser grids too.
+
+        ``flipped``: the source's normals were turned over, and are to be on coarser grids as well.
+        """
+        config, voxel_size = self.config, described[0].voxel_size
+        threshold = config.estimator.inlier_threshold * voxel_size
         matched, weighed, hypotheses = self.propose(described, clock, viewpoints)
         with single_blas_thread():
             chooser = Chooser(
@@ -185,18 +226,11 @@ class Registrar:
             findings = chooser.conclude()
             if self._is_doubtful(findings.judgement):
                 for grid in config.second_look.grids:
-                    chooser.consider(self.propose_on_grid(grid * voxel_size, described, clock, viewpoints))
+                    size = grid * voxel_size
+                    more = self.propose_on_grid(size, described, clock, viewpoints, flipped=flipped)
+                    chooser.consider(more)
                 findings = chooser.conclude(config.second_look.num_refined, config.second_look.num_judged)
-        if voxel_size > wanted:
-            findings = findings.with_note(
-                f"a voxel size of {wanted:.4g} gives more than {config.preparation.max_points} voxels; "
-                f"{voxel_size:.4g} was used (preparation.max_points sets the limit)"
-            )
-        if self._shows_motions:  # nothing weighs anything where no motion was found
-            weighed = findings.weighed or FilterOutput(np.zeros(len(matched)))
-        result = finished_result(described, matched, findings, config, threshold, clock.stop())
-        inliers = findings.residuals(matched) < threshold
-        return Explanation(result, *clouds, matched, weighed, inliers)
+        return _Look(described, matched, weighed, findings)
 
     def describe(
         self, source: PointCloud, target: PointCloud, voxel_size: float, clock: StageClock
@@ -253,10 +287,12 @@ class Registrar:
         described: tuple[PreparedCloud, PreparedCloud],
         clock: StageClock,
         viewpoints: tuple[FloatArray, FloatArray] | None = None,
+        *,
+        flipped: bool = False,
     ) -> list[Hypothesis]:
         """Hypotheses from the same clouds on a coarser grid of this edge, where features see more.
 
-        None where a cloud is too small for the grid.
+        None where a cloud is too small for the grid. ``flipped``: with the source's normals turned over.
         """
         clouds = [PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in described]
         views = [cloud.viewpoint for cloud in described]
@@ -265,6 +301,8 @@ class Registrar:
             target = self.describe_cloud(clouds[1], voxel_size, views[1], clock)
         except EmptyCloudError:
             return []
+        if flipped:
+            source = flip_normals(source, self.config.preparation)
         return self.propose((source, target), clock, viewpoints)[2]
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
@@ -272,6 +310,14 @@ class Registrar:
         look = self.config.second_look
         doubtful = judgement.status != "ok" and judgement.confidence < look.below
         return doubtful and self.config.verification.enabled and len(look.grids) > 0
+
+    def _asks_flipped(self, judgement: Judgement) -> bool:
+        """Whether, no sensor being known, the pair is asked again with the source's normals turned over.
+
+        A guessed sensor may stand on the wrong side of everything, as behind a wall, and then no feature of
+        one scan is like any of the other.
+        """
+        return judgement.status != "ok" and self.config.second_look.flip and self.config.verification.enabled
 
     @property
     def _shows_motions(self) -> bool:

@@ -57,7 +57,7 @@ class Alternative:
     translation_difference: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no single truth value: compare what matters
 class RegistrationResult:
     """The answer to "which rigid motion lays source on target?", with its own judgement.
 
@@ -127,7 +127,13 @@ class RegistrationResult:
             raise InputError(
                 f"this result holds no transform (status {self.status}: {'; '.join(self.reasons)})"
             )
-        array = np.asarray(points, dtype=np.float64)
+        try:
+            array = np.asarray(points, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"points must be numbers of shape (N, 3), found a {type(points).__name__}; "
+                "geomoe3d.load_points(...).file_points gives those of a file or an object"
+            ) from None
         if array.ndim != 2 or array.shape[1] != 3:
             raise InputError(f"points must have shape (N, 3), found {array.shape}")
         return transform_points(self.T_target_source, array)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_atomically, write_text
 from geomoe3d.result import RegistrationResult
 from geomoe3d.types import FloatArray
 
@@ -40,13 +40,13 @@ def save_transform(
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(f"'{path}' not written: expected a finite (4, 4) matrix, found {T.tolist()}")
     suffix = check_suffix(path, (".txt", ".npy"))
+    if suffix == ".txt":
+        write_text(path, transform_text(T, comments), force=force)
+        return
 
     def write(temporary: Path) -> None:
-        if suffix == ".txt":
-            temporary.write_text(transform_text(T, comments), encoding="utf-8")
-        else:
-            with temporary.open("wb") as stream:
-                np.save(stream, T)
+        with temporary.open("wb") as stream:
+            np.save(stream, T)
 
     write_atomically(path, write, force=force)
 
@@ -65,12 +65,7 @@ def save_result(
     """
     path = Path(path)
     if check_suffix(path, TRANSFORM_SUFFIXES) == ".json":
-        text = result.to_json() + "\n"
-
-        def write(temporary: Path) -> None:
-            temporary.write_text(text, encoding="utf-8")
-
-        write_atomically(path, write, force=force)
+        write_text(path, result.to_json() + "\n", force=force)
         return True
     if not has_transform(result):
         return False

@@ -1,4 +1,4 @@
-"""The few nouns that travel through the package: a cloud, a prepared cloud, correspondences, a hypothesis.
+"""The few nouns that travel through the package: clouds, correspondences, their weights, motions.
 
 All of them are frozen; arrays inside are float64 unless said otherwise and are to be treated as read-only.
 Frames: a *file* coordinate is what the user's data holds; a *local* coordinate is the file coordinate minus
@@ -156,3 +156,23 @@ class Hypothesis:
     score: float
     num_inliers: int
     verdict: float | None = None
+
+
+@dataclass(frozen=True)
+class FilterOutput:
+    """What a filter says of N correspondences.
+
+    Attributes:
+        weights: (N,) in [0, 1]; 0 takes a correspondence out of the estimate.
+        logits: (N,) raw scores, larger is likelier an inlier, or None.
+        groups: (N,) small integers, which part of the filter handled each correspondence, or None.
+        group_names: a name for each group, for display.
+        hypotheses: motions that the filter judged, best first; the weights hold under the first, and the
+            estimator need not seek them again. Empty for filters that know none.
+    """
+
+    weights: FloatArray
+    logits: FloatArray | None = None
+    groups: IntArray | None = None
+    group_names: tuple[str, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()

@@ -151,7 +151,7 @@ class DaskPool(Pool):
             distributed = import_module("distributed")
         except ImportError:
             raise DependencyError(
-                "a cluster needs Dask, which is not installed: pip install 'geomoe3d[dask]'"
+                "a cluster needs Dask, which is not installed: pip install dask distributed"
             ) from None
         try:
             self._client = distributed.Client(address, timeout=wait_seconds)

@@ -4,7 +4,7 @@
 
 Predictions lie in OUT and are not made twice: killed, it goes on; with everything predicted it only scores.
 The tables replace what stands between the two marks in the document; OUT/report.html shows the rest. Peers
-that are not installed (`pip install 'geomoe3d[peers]'`) are named and left out.
+that are not installed are named, with what pip is to install, and left out.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.predict import MethodSpec, predict
 from geomoe3d.evaluation.report_markdown import benchmark_tables
 from geomoe3d.evaluation.study import score_study, write_report
 from geomoe3d.evaluation.task import Task
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 ESTIMATORS = ("geomoe", "geomoe-svd", "consensus", "spectral", "open3d-ransac-50k", "open3d-fgr", "gc-ransac")
@@ -42,7 +43,7 @@ PARTS = (
     Part("1m", ("open3d-ransac-1m",), (Task("3DMatch", "1k", every=8), Task("3DLoMatch", "1k", every=8))),
     Part("all", ("consensus",), (Task("3DMatch", "all", every=8), Task("3DLoMatch", "all", every=8))),
     Part("clouds", SYSTEMS, (Task("3DMatch", "clouds", every=4), Task("3DLoMatch", "clouds", every=4))),
-    Part("unrelated", ("geomoe3d",), (Task("unrelated", "clouds"),)),
+    Part(UNRELATED, ("geomoe3d",), (Task(UNRELATED, "clouds"),)),
 )
 
 
@@ -89,11 +90,7 @@ def put_tables(document: Path, tables: str) -> None:
     if not (found and closed):
         raise SystemExit(f"'{document}' lacks the marks '{BEGIN}' and '{END}'")
     new = f"{before}{BEGIN}\n\n{tables.strip()}\n\n{END}{after}"
-    write_atomically(document, lambda path: _put(path, new), force=True)
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_text(document, new, force=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import argparse
 
 import numpy as np
 
+from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.calibration import auroc_of, calibration_error_of
 from geomoe3d.evaluation.study import score_study
 
@@ -24,7 +25,7 @@ def main() -> None:
     given = parser.parse_args()
     runs = [r.score for r in score_study(given.out) if r.score.info.label == given.run]
     runs = [run for run in runs if run.info.track == "clouds"]
-    pairs = [p for run in runs if run.info.benchmark != "unrelated" for p in run.pairs]
+    pairs = [p for run in runs if run.info.benchmark != UNRELATED for p in run.pairs]
     confidence = np.array([p.confidence or 0.0 for p in pairs])
     right = np.array([p.right for p in pairs])
     everything = np.ones((1, len(pairs)))
@@ -34,7 +35,7 @@ def main() -> None:
     print(f"calibration error {calibration_error_of(confidence, right)(everything)[0]:.4f}")
     print(f"called ok {100 * ok.mean():.1f} %, of these right {100 * right[ok].mean():.1f} %")
     for run in runs:
-        if run.info.benchmark == "unrelated":
+        if run.info.benchmark == UNRELATED:
             accepted = sum(p.status == "ok" for p in run.pairs)
             print(f"unrelated: {accepted} of {len(run.pairs)} called ok")
 

@@ -8,6 +8,7 @@ source's points.
 
 from __future__ import annotations
 
+import argparse
 import time
 
 import numpy as np
@@ -24,6 +25,8 @@ VOXEL_SIZE = 0.05
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.parse_args()
     turn = Rotation.from_rotvec(np.radians(2) * np.array([0.6, -0.5, 0.62])).as_matrix()
     disturbance = make_transform(turn, np.array([0.03, -0.02, 0.03]))
     print("| pair | method | reach (voxels) | rotation error | position error | time |")

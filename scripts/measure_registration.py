@@ -24,6 +24,7 @@ import numpy as np
 from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import BENCHMARKS, BenchmarkPair, load_benchmark
+from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, UNRELATED
 from geomoe3d.evaluation.measures import is_right, motion_errors
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, translation_error
 from geomoe3d.registration import Registrar
@@ -50,7 +51,9 @@ def kiss_matcher(voxel_size: float = 0.05) -> Peer | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--every", type=int, default=4, help="take every n-th pair")
-    parser.add_argument("--unrelated", type=int, default=200, help="pairs of different scenes to try")
+    parser.add_argument(
+        "--unrelated", type=int, default=NUM_UNRELATED, help="pairs of different scenes to try"
+    )
     parser.add_argument("--no-peer", action="store_true", help="leave KISS-Matcher out")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="configuration")
     parser.add_argument("--out", default="runs/registration.jsonl", help="one line per pair")
@@ -69,7 +72,7 @@ def main() -> None:
             print_rows(benchmark, rows)
         if given.unrelated:
             rows = [unrelated(pair, registrar) for pair in unrelated_pairs(given.unrelated)]
-            stream.writelines(json.dumps({"benchmark": "unrelated", **row}) + "\n" for row in rows)
+            stream.writelines(json.dumps({"benchmark": UNRELATED, **row}) + "\n" for row in rows)
             accepted = sum(row["status"] == "ok" for row in rows)
             print(f"\nunrelated pairs called ok: {accepted} of {len(rows)}")
 

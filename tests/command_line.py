@@ -55,12 +55,14 @@ class FakeRegistrar:
     answer: RegistrationResult | BaseException
     noise = ""
     asked: list
+    initial = None
 
     def __init__(self, config=None):
         self.config = config
 
-    def register(self, source, target, *, progress=None):
+    def register(self, source, target, *, initial=None, progress=None):
         type(self).asked.append((source, target, self.config))
+        type(self).initial = initial
         for stage in ("load", "judge"):
             progress(stage)
         if self.noise:
@@ -70,8 +72,8 @@ class FakeRegistrar:
             raise self.answer
         return self.answer
 
-    def explain(self, source, target, *, progress=None):
-        result = self.register(source, target, progress=progress)
+    def explain(self, source, target, *, initial=None, progress=None):
+        result = self.register(source, target, initial=initial, progress=progress)
         points = np.random.default_rng(0).normal(size=(50, 3))
         moved = transform_points(TRUTH, points)
         origin = np.round(moved.mean(axis=0))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +18,21 @@ import pytest
 from small_scans import SETTINGS, cut, scene
 
 from geomoe3d import register_pairs
+from geomoe3d.batch.folder import JOURNAL_FILE, RESULTS_FILE
 from geomoe3d.batch.memory import choose_workers, worker_bytes
-from geomoe3d.batch.store import JOURNAL_FILE, RESULTS_FILE
+from geomoe3d.batch.run import BatchReport
+from geomoe3d.batch.store import Outcome
 from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
+from geomoe3d.cli.batch import table as summary
 from geomoe3d.config import load_config
-from geomoe3d.errors import DependencyError, FormatError, InputError, OutputError
+from geomoe3d.errors import (
+    CheckpointError,
+    ConfigError,
+    DependencyError,
+    FormatError,
+    InputError,
+    OutputError,
+)
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.journal import read_journal
 from geomoe3d.registration import Registrar
@@ -106,6 +118,12 @@ def test_paths_are_relative_to_the_table_and_ids_are_made_where_missing(tmp_path
         ("source,target,initial," + ",".join(MATRIX_COLUMNS) + "\n", FormatError, "both the column"),
         ("source,target," + ",".join(MATRIX_COLUMNS) + "\na,b" + ",2" * 16 + "\n", InputError, "no rigid"),
         ("source,target," + ",".join(MATRIX_COLUMNS) + "\na,b" + ",x" * 16 + "\n", InputError, "16 numbers"),
+        ("source,target,initail\na,b,g.txt\n", FormatError, "column 'initail', which is nearly 'initial'"),
+        ("Initial,source,target\ng.txt,a,b\n", FormatError, "column 'Initial', which is nearly 'initial'"),
+        ("source,target,T_00\na,b,1\n", FormatError, "column 'T_00', which is nearly 'T00'"),
+        ("source,target,ID\na,b,1\n", FormatError, "column 'ID', which is nearly 'id'"),
+        ("source,target,id,id\na,b,1,2\n", FormatError, "more than one column 'id'"),
+        ("source,target\na,b\na,1.ply,b\n", FormatError, "line 3 has more cells than the 2 .* 'b'; put"),
     ],
 )
 def test_a_table_that_cannot_be_used_is_refused_with_its_line(tmp_path, text, kind, message):
@@ -113,6 +131,11 @@ def test_a_table_that_cannot_be_used_is_refused_with_its_line(tmp_path, text, ki
     path.write_text(text)
     with pytest.raises(kind, match=message):
         read_pairs(path)
+
+
+def test_columns_unlike_any_known_one_and_empty_cells_beyond_the_last_are_ignored(tmp_path):
+    (tmp_path / "t.csv").write_text("source,target,source_id,note,ids,scene\na,b,1,c,2,d,,\n")
+    assert [row.id for row in read_pairs(tmp_path / "t.csv")] == ["a+b"]
 
 
 def test_tables_that_are_no_text_or_not_there(tmp_path):
@@ -159,9 +182,29 @@ def test_pairs_in_memory(tmp_path):
     rows = as_rows([("a", "b"), (Path("a"), Path("c"), np.eye(4))])
     assert [row.id for row in rows] == ["a+b", "a+c"]
     assert rows[1].matrix.tolist() == np.eye(4).tolist()
-    for bad in ([], ["ab"], [("a",)], [(np.zeros((3, 3)), "b")], [("a", "b"), ("a", "b")]):
+    assert [row.id for row in as_rows(np.array([("a", "b")]))] == ["a+b"]
+    for bad in ([], ["ab"], [("a",)], [("a", "b"), ("a", "b")]):
         with pytest.raises(InputError):
             as_rows(bad)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        (None, "must be a CSV file or a list of .source, target.* found None"),
+        (np.zeros((5, 6)), r"list of .* found ndarray of shape \(5, 6\)"),
+        (7, "list of .* found int 7"),
+        ({"a": "b"}, "list of .* found dict of 1"),
+        ([None], "pair 1: expected .* found None"),
+        ([("a", "b"), {"a", "b"}], "pair 2: expected .* found set of 2"),
+        ([(np.zeros((9, 3)), "b")], r"pair 1: .* must be paths of files, found ndarray of shape \(9, 3\)"),
+        ([("a", None)], "pair 1: .* must be paths of files, found None"),
+    ],
+)
+def test_what_is_no_path_is_named(tmp_path, pairs, message):
+    with pytest.raises(InputError, match=message):
+        register_pairs(pairs, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 # ---- results ----------------------------------------------------------------------------------------
@@ -205,10 +248,10 @@ def test_transforms_and_page_are_written(finished):
 
 def test_called_again_nothing_is_done_again(scans, finished):
     _, out = finished
-    before = (out / JOURNAL_FILE).read_bytes()
-    again = register_pairs(scans[0] / "pairs.csv", out, config=CONFIG)
+    files = everything(out)
+    again = register_pairs(scans[0] / "pairs.csv", out, config=CONFIG, transforms=True, page=True)
     assert (again.made, again.kept) == (0, 5)
-    assert (out / JOURNAL_FILE).read_bytes() == before
+    assert everything(out) == files
     retried = register_pairs(scans[0] / "pairs.csv", out, config=CONFIG, retry=True)
     assert (retried.made, retried.kept) == (2, 3)
 
@@ -243,6 +286,126 @@ def test_a_changed_row_or_file_is_done_again_and_the_rest_is_kept(scans, tmp_pat
     assert (report.made, report.kept) == (1, 1)
     fresh = register_pairs(table, out, config=CONFIG, fresh=True)
     assert (fresh.made, fresh.kept) == (2, 0)
+
+
+# ---- what is the batch's own in its folder --------------------------------------------------------
+
+
+def everything(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """A finished batch of the test's own."""
+    shutil.copytree(finished[1], tmp_path / "copied")
+    return tmp_path / "copied"
+
+
+@pytest.mark.parametrize("new", [False, True], ids=["begun anew", "new"])
+@pytest.mark.parametrize(
+    ("named", "kind", "message"),
+    [
+        ({"workers": 1000}, InputError, "1000 workers would take"),
+        ({"workers": 1, "scheduler": "tcp://127.0.0.1:1"}, InputError, "either workers or a scheduler"),
+        ({"scheduler": "tcp://127.0.0.1:1"}, DependencyError, "needs Dask"),
+        ({"cache": __file__}, OutputError, "is a file; described clouds are kept in a folder"),
+        ({"cache": f"{__file__}/deeper"}, OutputError, "is a file"),
+        ({"config": ["filter.name=nothing"]}, ConfigError, "unknown filter"),
+        ({"config": ["filter.name=geomoe", "filter.weights=nowhere"]}, CheckpointError, "nowhere"),
+    ],
+)
+def test_what_is_refused_is_before_anything_is_removed_or_written(
+    scans, copied, monkeypatch, new, named, kind, message
+):
+    import geomoe3d.workers as workers
+
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(workers, "import_module", absent)
+    monkeypatch.setattr("geomoe3d.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
+    folder = copied.with_name("new") if new else copied
+    before = everything(folder)
+    named = {**named, "config": load_config(None, [*SETTINGS, *named.get("config", [])])}
+    with pytest.raises(kind, match=message):
+        register_pairs(scans[0] / "pairs.csv", folder, fresh=not new, **named)
+    assert everything(folder) == before
+    assert folder.exists() != new
+
+
+def test_a_worker_that_dies_as_it_begins_costs_no_results(scans, copied, monkeypatch):
+    monkeypatch.setattr("geomoe3d.batch.run.make_ready", die_always)
+    monkeypatch.setattr("geomoe3d.batch.run.Settings.of", lambda *given: 2)
+    before = everything(copied)
+    with pytest.raises(OutputError, match="a worker died as it began"):
+        register_pairs(scans[0] / "pairs.csv", copied, config=CONFIG, fresh=True, workers=1)
+    assert everything(copied) == before
+
+
+def test_beginning_anew_removes_what_the_batch_left_and_nothing_else(scans, copied):
+    mine = [copied / "notes.md", copied / "transforms" / "ab.npy", copied / "transforms" / "mine.txt"]
+    for path in mine:
+        path.write_text("mine")
+    renamed = copied / "transforms" / "ab before.txt"
+    renamed.write_bytes((copied / "transforms" / "ab.txt").read_bytes())
+    one = copied.with_name("one.csv")
+    write_table(one, [("1", scans[0] / "a", scans[0] / "b")])
+    other = load_config(None, [*SETTINGS, "seed=1"])
+    register_pairs(one, copied, config=other, fresh=True)
+    left = {path.relative_to(copied).as_posix() for path in everything(copied)}
+    kept = {"notes.md", "transforms/ab.npy", "transforms/mine.txt", "transforms/ab before.txt"}
+    assert left == {"run.json", JOURNAL_FILE, RESULTS_FILE, *kept}
+    for path in (*mine, renamed):
+        path.unlink()
+    (copied / "page.html").write_text("<html>mine</html>")
+    register_pairs(one, copied, config=other, transforms=True)
+    register_pairs(one, copied, config=other, fresh=True)
+    assert not (copied / "transforms").exists()
+    assert (copied / "page.html").read_text() == "<html>mine</html>"
+
+
+def test_transforms_of_pairs_that_have_none_any_more_are_removed(scans, copied, tmp_path):
+    folder = copied / "transforms"
+    mine = folder / "mine.txt"
+    head = "# maps SOURCE (a) into TARGET (b): p_target = R p_source + t\n# status ok, confidence 1.0"
+    mine.write_text(f"{head}, geomoe3d 0.1.0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")  # of one registration
+    (folder / "earlier.txt").write_text(f"{head}\n1 0 0 0\n")  # of a batch that did not name its pair yet
+    lines = (scans[0] / "pairs.csv").read_text().replace("ac,a.npy,c.npy", "ac,a.npy,missing.npy")
+    table = scans[0] / "changed.csv"
+    table.write_text("".join(line for line in lines.splitlines(True) if not line.startswith("bc")))
+    register_pairs(table, copied, config=CONFIG, transforms=True)
+    assert sorted(path.name for path in folder.iterdir()) == ["ab.txt", "mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("results.jsonl", {}),
+        ("journal.jsonl", {}),
+        ("run.json", {}),
+        ("page.html", {"page": True}),
+        ("transforms", {"transforms": True}),
+        ("transforms/ab.txt", {"transforms": True}),
+    ],
+)
+@pytest.mark.parametrize("fresh", [False, True])
+def test_files_of_the_users_are_not_overwritten(scans, tmp_path, name, named, fresh):
+    path = tmp_path / "out" / name
+    path.parent.mkdir(parents=True)
+    for text in ("mine", '{"identity": {"method": "of something else"}}'):
+        path.write_text(text)
+        with pytest.raises(InputError, match=rf"{name}' (is not of|does not describe) a batch of geomoe3d"):
+            register_pairs(scans[0] / "pairs.csv", tmp_path / "out", config=CONFIG, fresh=fresh, **named)
+        assert everything(tmp_path / "out") == {path: text.encode()}
+
+
+def test_an_id_too_long_for_a_file_name_is_refused_before_work(scans, tmp_path):
+    table = tmp_path / "t.csv"
+    write_table(table, [("/" * 90, scans[0] / "a", scans[0] / "b")])
+    with pytest.raises(InputError, match="a file name of 274 bytes, at most 255"):
+        register_pairs(table, tmp_path / "out", config=CONFIG, transforms=True)
+    assert not (tmp_path / "out").exists()
 
 
 def test_two_batches_in_one_folder_are_refused(scans, finished):
@@ -344,8 +507,35 @@ def test_exit_codes_of_a_good_and_of_an_unusable_table(scans, finished, tmp_path
     good.write_text(f"id,source,target\nab,{scans[0] / 'a.npy'},{scans[0] / 'b.npy'}\n")
     done = run_cli(good, finished[1], *OPTIONS, "--quiet", check=0)  # done there already
     assert done.stdout == done.stderr == ""
-    assert "holds no pairs" not in run_cli(tmp_path / "none.csv", tmp_path / "x", check=2).stderr
+    said = run_cli(tmp_path / "none.csv", tmp_path / "x", check=2).stderr
+    assert said == f"error: cannot read '{tmp_path / 'none.csv'}': No such file or directory\n"
     assert not (tmp_path / "x").exists()
+
+
+def test_too_many_workers_with_fresh_leave_the_results(scans, copied):
+    before = everything(copied)
+    done = run_cli(scans[0] / "pairs.csv", copied, *OPTIONS, "--workers", "1000000", "--fresh", check=2)
+    assert "use at most --workers" in done.stderr
+    assert everything(copied) == before
+
+
+def test_a_cache_that_is_a_file_is_refused(scans, finished, tmp_path):
+    arguments = (scans[0] / "pairs.csv", tmp_path / "o", *OPTIONS)
+    broken = scans[0] / "broken.ply"
+    environments = ({}, {"env": {**os.environ, "GEOMOE3D_CACHE": str(broken)}})
+    for options, named in zip((("--cache", broken), ()), environments, strict=True):
+        done = run_cli(*arguments, *options, check=2, **named)
+        assert done.stderr == (
+            f"error: '{broken}' is a file; described clouds are kept in a folder: give one, or none\n"
+        )
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_first_reason_of_a_pair_is_told(finished):
+    report, folder = finished
+    result = replace(report.outcomes[0].result, status="low_confidence", reasons=("what decides", "a remark"))
+    told = summary(BatchReport(folder, (Outcome("ab", result, None),), 1, 0)).splitlines()[-1]
+    assert told.endswith("low_confidence  what decides")
 
 
 def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_path):
@@ -370,14 +560,14 @@ def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_pa
     assert done[: len(before)] == before
 
 
-def test_without_dask_a_scheduler_names_the_extra(scans, tmp_path, monkeypatch):
+def test_without_dask_a_scheduler_says_what_to_install(scans, tmp_path, monkeypatch):
     import geomoe3d.workers as workers
 
     def absent(name):
         raise ImportError(name)
 
     monkeypatch.setattr(workers, "import_module", absent)
-    with pytest.raises(DependencyError, match=r"geomoe3d\[dask\]"):
+    with pytest.raises(DependencyError, match=r"needs Dask, which is not installed: pip install .*d"):
         register_pairs(scans[0] / "pairs.csv", tmp_path / "o", config=CONFIG, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="either workers or a scheduler"):
         register_pairs(

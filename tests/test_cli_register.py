@@ -233,8 +233,21 @@ def test_the_answer_is_printed_even_if_it_cannot_be_written(
     def full(*arguments, **options):
         raise OutputError("no space left")
 
-    monkeypatch.setattr(transform_files, "write_atomically", full)
+    monkeypatch.setattr(transform_files, "write_text", full)
     assert call("register", *scan_files, "--output", tmp_path / "T.txt") == 2
     printed = capsys.readouterr()
     assert matrix_text(TRUTH) in printed.out
     assert "no space left" in printed.err
+
+
+def test_a_first_guess_of_a_file_is_handed_on(tmp_path, scan_files, fake_registrar):
+    np.savetxt(tmp_path / "T.txt", TRUTH)
+    assert call("register", *scan_files, "--initial", str(tmp_path / "T.txt")) == 0
+    np.testing.assert_array_equal(fake_registrar.initial, TRUTH)
+    assert call("register", *scan_files) == 0
+    assert fake_registrar.initial is None
+
+
+def test_a_first_guess_that_is_not_there_is_named(tmp_path, scan_files, fake_registrar, capsys):
+    assert call("register", *scan_files, "--initial", str(tmp_path / "T.txt")) == 2
+    assert "T.txt not found" in capsys.readouterr().err

@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -281,9 +282,10 @@ ORDER = [
     },
     {"geometry", "result", "transform_files"},
     {"clouds"},
-    {"filters", "estimators", "data"},
-    {"verification", "refine", "judge", "plausibility", "answer", "stages"},
-    {"choice"},
+    {"estimators", "data"},
+    {"filters"},
+    {"verification", "refine", "judge", "answer", "stages"},
+    {"choice", "correspondence_solver", "remarks"},
     {"registration"},
     {"evaluation", "training", "visual", "batch", "multiway"},
     {"cli", "__main__"},
@@ -336,11 +338,21 @@ def test_no_file_imports_upward(path):
         assert level_of(module) <= level_of(own), f"{own} imports {module}, which stands above it"
 
 
+def test_no_rooms_import_each_other():
+    """Not even those of one level, and over no detour."""
+    wanted = {}
+    for path in FILES:
+        own = path.relative_to(PACKAGE).with_suffix("").parts[0]
+        others = {module.split(".")[1] for module in imports_of(path)} - {own}
+        wanted.setdefault(own, set()).update(others)
+    TopologicalSorter(wanted).prepare()  # raises CycleError with the names of a circle
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_no_file_imports_heavy_libraries_when_it_is_imported(path):
-    """torch alone may be, by the files of networks, of solvers and of training, which load when used."""
+    """torch alone may be, by the files of networks, of fits and of training, which load when used."""
     tree = ast.parse(path.read_text(), str(path))
-    rooms = {"filters", "training", "geometry", "estimators"}
+    rooms = {"filters", "training", "geometry"}
     allowed = {"scipy", "torch"} if rooms & set(path.relative_to(PACKAGE).parts) else {"scipy"}
     found = set()
     for node in tree.body:

@@ -16,13 +16,13 @@ import pytest
 from small_scans import SETTINGS, cut, scene
 
 from geomoe3d import register_pairs
-from geomoe3d.batch.store import JOURNAL_FILE, RESULTS_FILE
+from geomoe3d.batch.folder import JOURNAL_FILE, RESULTS_FILE
 from geomoe3d.config import load_config
-from geomoe3d.errors import InputError
+from geomoe3d.errors import DependencyError, InputError
 from geomoe3d.journal import read_journal
 from geomoe3d.workers import DaskPool
 
-pytest.importorskip("distributed", reason="Dask is not installed: pip install 'geomoe3d[dask]'")
+pytest.importorskip("distributed", reason="Dask is not installed: pip install dask distributed")
 
 CONFIG = load_config(None, SETTINGS)
 ROOT = Path(__file__).parents[1]
@@ -109,6 +109,18 @@ def test_a_worker_killed_in_the_middle_costs_nothing_and_the_bytes_are_those_of_
     assert sorted(r["id"] for r in read_journal(journal)) == sorted(o.id for o in report.outcomes)
     assert (tmp_path / "dask" / RESULTS_FILE).read_bytes() == (tmp_path / "alone" / RESULTS_FILE).read_bytes()
     assert report.counts() == alone.counts()
+
+
+def test_workers_of_other_versions_are_refused_before_anything_is_removed(
+    cluster, table, tmp_path, monkeypatch
+):
+    (table.parent / "one.csv").write_text("source,target\na.npy,b.npy\n")
+    register_pairs(table.parent / "one.csv", tmp_path, config=CONFIG, cache="")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr("geomoe3d.batch.task.library_versions", lambda: {"numpy": "0"})
+    with pytest.raises(DependencyError, match="a worker runs other versions"):
+        register_pairs(table.parent / "one.csv", tmp_path, config=CONFIG, scheduler=cluster[0], fresh=True)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_scheduler_that_is_not_there_is_named():

@@ -212,6 +212,14 @@ def test_broken_lists_and_poses_are_named(tmp_path: Path) -> None:
     recording = open_recording(tum)
     assert len(recording.frames) == 1
     assert [line[:16] for line in recording.skipped] == ["depth.txt line 2", "depth.txt line 3"]
+    (tum / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 0\n3.0 0 nan 0 0 0 0 1\n")
+    (tum / "depth.txt").write_text("".join(f"{k}.0 depth/{k}.png\n" for k in (1, 2, 3)))
+    recording = open_recording(tum)
+    assert len(recording.frames) == 1
+    assert recording.skipped == [
+        "2.png: the pose holds no rotation (its quaternion is zero)",
+        "3.png: the pose is not finite",
+    ]
 
 
 def test_lengths_must_be_positive(tmp_path: Path) -> None:

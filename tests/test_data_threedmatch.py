@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from geomoe3d.data.threedmatch import (
     DATA_VARIABLE,
     find_data_root,
+    iterate_fixed_correspondences,
     load_benchmark,
-    load_fixed_correspondences,
     read_gt_info,
     read_gt_log,
     read_gt_overlap,
@@ -147,7 +147,7 @@ def test_real_benchmark_counts(benchmark: str, count: int) -> None:
 
 def test_real_fixed_correspondences_agree_with_the_ground_truth() -> None:
     root = real_data()
-    fixed = load_fixed_correspondences(root, "3DMatch")
+    fixed = list(iterate_fixed_correspondences(root, "3DMatch"))
     truth = {(p.scene, p.source_index, p.target_index): p for p in load_benchmark(root, "3DMatch")}
     assert len(fixed) == len(truth) == 843
     ratios = []

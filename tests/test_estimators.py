@@ -28,7 +28,6 @@ from geomoe3d.estimators.base import make_estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
 from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
-from geomoe3d.geometry.rigid_fit import spread
 from geomoe3d.geometry.se3 import inverse, transform_points
 
 
@@ -46,7 +45,9 @@ def test_a_mirrored_scene_is_not_called_a_fit() -> None:
     source = room_points(np.random.default_rng(24), 300)
     rows = np.hstack([source, source * [1, 1, -1]])
     for estimator in (CONSENSUS, RANSAC, SVD):
-        for h in estimator(rows, inlier_threshold=THRESHOLD):
+        found = estimator(rows, inlier_threshold=THRESHOLD)
+        assert found  # what is flat fits all the same
+        for h in found:
             assert np.linalg.det(h.T_target_source[:3, :3]) == pytest.approx(1)
             assert h.num_inliers < 200
 
@@ -201,16 +202,18 @@ def test_targets_on_one_point_determine_nothing(estimator) -> None:
 
 
 @ROBUST
-@pytest.mark.parametrize("seed", range(5))
-def test_garbage_gives_no_identity(estimator, seed: int) -> None:
-    """Random rows: nothing, or a motion that at least three rows follow."""
-    rng = np.random.default_rng(seed)
-    rows = rng.uniform(-5, 5, (30, 6))
-    for h in estimator(rows, inlier_threshold=0.05, seed=seed):
-        T = h.T_target_source
-        assert not np.allclose(T, np.eye(4))
-        residuals = np.linalg.norm(transform_points(T, rows[:, :3]) - rows[:, 3:], axis=1)
-        assert h.num_inliers == (residuals < 0.05).sum() >= 3
+def test_garbage_gives_no_identity(estimator) -> None:
+    """Random rows: nothing, or a motion that at least three rows follow; by chance some do."""
+    num_found = 0
+    for seed in range(5):
+        rows = np.random.default_rng(seed).uniform(-5, 5, (30, 6))
+        for h in estimator(rows, inlier_threshold=0.5, seed=seed):
+            T = h.T_target_source
+            assert not np.allclose(T, np.eye(4))
+            residuals = np.linalg.norm(transform_points(T, rows[:, :3]) - rows[:, 3:], axis=1)
+            assert h.num_inliers == (residuals < 0.5).sum() >= 3
+            num_found += 1
+    assert num_found > 0
 
 
 @pytest.mark.parametrize("count", [4, 10])
@@ -226,10 +229,12 @@ def test_inliers_on_a_line_are_no_motion(estimator) -> None:
     """Twenty true rows on one line leave the turn about it free, whatever the wrong rows look like."""
     T, wrong = random_motion(1), np.random.default_rng(0).uniform(-5, 5, (8, 6))
     rows = np.vstack([np.hstack([line(20), transform_points(T, line(20))]), wrong])
-    for h in estimator(rows, inlier_threshold=THRESHOLD):
-        moved = transform_points(h.T_target_source, rows[:, :3])
-        close = np.linalg.norm(moved - rows[:, 3:], axis=1) < THRESHOLD
-        assert spread(rows[close, :3], np.ones(close.sum())) > 0.01 * THRESHOLD
+    assert estimator(rows, inlier_threshold=THRESHOLD) == []
+    beside = room_points(np.random.default_rng(0), 5)  # these do not leave it free
+    rows = np.vstack([rows, np.hstack([beside, transform_points(T, beside)])])
+    found = estimator(rows, inlier_threshold=THRESHOLD)
+    assert_motion(found[0].T_target_source, T)
+    assert found[0].num_inliers == 25
 
 
 GOOD = np.hstack([room_points(np.random.default_rng(0), 10)] * 2)
@@ -298,7 +303,6 @@ for seed, count in ((0, 300), (1, 1500), (2, 4000), (3, 40000)):
     weights = rng.random(count)
     rows = np.hstack([source, target])
     show("svd", WeightedSvdEstimator(), rows, weights)
-    show("refits", WeightedSvdEstimator(5), rows, weights)
     wrong = rng.random(count) < 0.8
     target[wrong] = target[rng.integers(0, max(count // 2, 1), count)][wrong]
     rows = np.hstack([source, target])
@@ -323,7 +327,7 @@ def test_the_same_bytes_for_any_number_of_threads() -> None:
         )
         answers.append(done.stdout.splitlines())
     lines = {answer.split()[0] for answer in answers[0]}
-    assert lines == {"svd", "refits", "consensus", "asking", "ransac"}
+    assert lines == {"svd", "consensus", "asking", "ransac"}
     assert answers[1] == answers[2], "two runs with two threads differ"
     differing = {tuple(a.split()[:2]) for a, b in zip(*answers[:2], strict=True) if a != b}
     assert not differing, "one thread and two threads differ"

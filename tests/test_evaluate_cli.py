@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from geomoe3d.cli.errors import run
+from geomoe3d.cli.evaluate import command as evaluate_group
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.clouds.io import save_points
 from geomoe3d.data.threedmatch import write_gt_log
+from geomoe3d.evaluation.benchmarks import NUM_UNRELATED
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 
 OWN = """
@@ -167,6 +169,13 @@ def test_bad_input_is_named(
     assert evaluate("predict", tmp_path / "out", *given) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.glob("out/*/predictions.jsonl"))
+
+
+def test_the_number_of_unrelated_pairs_is_that_of_the_benchmark() -> None:
+    """The command has a figure of its own, so that help comes without loading the evaluation."""
+    for name in ("predict", "run"):
+        (option,) = (o for o in evaluate_group.commands[name].params if o.name == "num_unrelated")
+        assert option.default == NUM_UNRELATED
 
 
 def test_nothing_to_score_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

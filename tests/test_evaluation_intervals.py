@@ -20,8 +20,8 @@ from geomoe3d.evaluation.calibration import (
     reliability_bins,
     risk_coverage,
 )
-from geomoe3d.evaluation.intervals import Quantity, measure, measure_all, quantile, wilson
-from geomoe3d.evaluation.records import PairScore
+from geomoe3d.evaluation.intervals import Quantity, measure_all, quantile, wilson
+from geomoe3d.evaluation.records import Measure, PairScore
 
 NAN = math.nan
 
@@ -56,6 +56,12 @@ def scored(
 
 def undefined(interval: tuple[float, float]) -> bool:
     return math.isnan(interval[0]) and math.isnan(interval[1])
+
+
+def measure(values, scenes, *, unit, statistic="mean", **how) -> Measure:
+    """One array of values alone."""
+    quantity = Quantity(np.asarray(values, dtype=np.float64), unit, statistic)
+    return measure_all({"": quantity}, scenes, **how)[""]
 
 
 # ---- values -----------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def test_ours_land_among_wrong_correspondences(name):
     rows = correspondences(0.3)
     answer = make_method(name)(pair_of(rows))
     assert lands(answer.T_target_source)
-    assert set(answer.seconds) == {"weigh", "solve"}
+    assert set(answer.stages) == {"weigh", "solve"}
     assert answer.status is None
     assert (answer.weights is None) == (answer.inliers is None) == (name == "consensus")
     if answer.inliers is not None:
@@ -128,8 +128,8 @@ def test_clouds_give_what_a_report_needs_in_file_coordinates(room):
     assert answer.status == "ok"
     assert answer.confidence is not None
     assert answer.confidence > 0.9
-    assert "verify" in answer.seconds
-    assert "total" not in answer.seconds
+    assert "verify" in answer.stages
+    assert "total" not in answer.stages
     rows = answer.correspondences
     assert rows is not None
     assert answer.inliers is not None

@@ -153,7 +153,8 @@ def test_changed_truth_is_noticed(posed_folder: Path, tmp_path: Path, use) -> No
     use(fake=Fake())
     run_one(copy, tmp_path / "out")
     pairs = [(i, j) for i in range(COUNT) for j in range(i + 1, COUNT)]
-    write_gt_log(copy / "room" / "gt.log", [(i, j, motion(i - j)) for i, j in pairs], COUNT, force=True)
+    (copy / "room" / "gt.log").unlink()
+    write_gt_log(copy / "room" / "gt.log", [(i, j, motion(i - j)) for i, j in pairs], COUNT)
     with pytest.raises(InputError, match="fingerprint"):
         run_one(copy, tmp_path / "out")
     with pytest.raises(InputError, match="ground truth"):

@@ -14,8 +14,10 @@ from geomoe3d.errors import InputError, OutputError
 from geomoe3d.evaluation.compare import compare
 from geomoe3d.evaluation.records import EvaluationPair, Measure, Prediction, RunScore
 from geomoe3d.evaluation.report_gallery import worst_failures
+from geomoe3d.evaluation.report_markdown import to_markdown
 from geomoe3d.evaluation.report_page import render_report, run_key, save_report
 from geomoe3d.evaluation.report_plots import is_unrelated
+from geomoe3d.evaluation.report_terminal import terminal_table
 from geomoe3d.evaluation.report_words import MAIN_MEASURES, interval_text, main_row, value_text
 
 
@@ -61,19 +63,38 @@ def test_page_is_well_formed_and_complete(two_runs):
     assert value_text(comparisons[0].recall_difference) in document.words
 
 
+def main_table(text: str) -> tuple[list[str], list[tuple[str, str]]]:
+    """Headings of the page's main table, and name and cells of each row, as HTML."""
+    table = text.split('id="main"')[1].split("</table>")[0]
+    heads = re.findall(r'<th scope="col"[^>]*>(.*?)</th>', table)
+    return heads, re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', table)
+
+
+def cell_values(cells: str) -> list[str]:
+    return [re.sub("<small>.*", "", cell) for cell in re.findall("<td>(.*?)</td>", cells)]
+
+
 def test_columns_are_those_of_the_text_reports(two_runs):
-    for score, _, _ in two_runs:
-        own = [value_text(m) for m in map(score.measures.get, MAIN_MEASURES)]
-        assert own == main_row(score)
+    heads, rows = main_table(report(*two_runs))
+    shown = [cell_values(cells) for _, cells in rows]
+    assert len(shown) == 2 and shown[0] != shown[1]
+    scores = [score for score, _, _ in two_runs]
+    table = to_markdown(scores).split("\n## ")[1]
+    head, _, *written = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
+    assert [heading.replace("<br>", " ") for heading in heads] == head
+    # The first number has its interval beside it.
+    assert shown == [[row[1].split()[0], *row[2:]] for row in written]
+    lines = terminal_table(scores, width=300).splitlines()
+    for score, values in zip(scores, shown, strict=True):
+        (line,) = (line for line in lines if line.startswith(score.info.label))
+        assert line.removeprefix(score.info.label).split() == values
 
 
 def test_main_table_row_by_row(two_runs):
-    table = report(*two_runs).split('id="main"')[1].split("</table>")[0]
-    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', table)
+    _, rows = main_table(report(*two_runs))
     for (name, cells), (score, _, _) in zip(rows, two_runs, strict=True):
         assert html.escape(score.info.label, quote=True) in name
-        values = [re.sub("<small>.*", "", cell) for cell in re.findall("<td>(.*?)</td>", cells)]
-        assert values == main_row(score)
+        assert cell_values(cells) == main_row(score)
         intervals = re.findall("<td>.*?(?:<small>(.*?)</small>)?</td>", cells)
         measures = map(score.measures.get, MAIN_MEASURES)
         assert intervals == [interval_text(measure) for measure in measures]

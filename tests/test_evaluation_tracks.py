@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posed_scans import real_root
 
-from geomoe3d.data.threedmatch import load_fixed_correspondences
+from geomoe3d.data.threedmatch import iterate_fixed_correspondences
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.benchmarks import load_pairs
 from geomoe3d.evaluation.tracks import TRACKS, InputMaker
@@ -52,7 +52,7 @@ def test_published_pairs_and_their_fixed_correspondences() -> None:
         assert len(pairs) == len({pair.id for pair in pairs}) == count
         maker = InputMaker("1k", benchmark)
         assert maker.identity(pairs)["from"] == "published 1k correspondences"
-        fixed = load_fixed_correspondences(None, benchmark)
+        fixed = iterate_fixed_correspondences(None, benchmark)
         for pair, expected in list(zip(pairs, fixed, strict=True))[:: count // 20]:
             assert pair.id == f"{expected.scene}/{expected.source_index}-{expected.target_index}"
             assert np.array_equal(maker(pair).correspondences, expected.points)

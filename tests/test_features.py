@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from surface_pairs import corner
 
-from geomoe3d.clouds.features import describe
+from geomoe3d.clouds.features import describe, flip_normals
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
 from geomoe3d.types import PointCloud
@@ -42,3 +42,16 @@ def test_a_point_without_neighbours_has_a_zero_feature() -> None:
     features = describe(lonely, CONFIG).features
     assert np.isfinite(features).all()
     assert (features[-1] == 0).all()
+
+
+def test_normals_turned_over_are_another_cloud_and_turned_back_the_same() -> None:
+    config = PreparationConfig(viewpoint="origin")
+    cloud = PointCloud(corner(np.random.default_rng(13), noise=0.003) + 1.0)
+    made = describe(prepare(cloud, 0.1, config, viewpoint=np.zeros(3)), config)
+    over = flip_normals(made, config)
+    np.testing.assert_array_equal(over.normals, -made.normals)
+    assert over.viewpoint is None
+    changed = np.linalg.norm(over.features - made.features, axis=1)
+    assert (changed > 0.1).mean() > 0.1  # plain walls look alike from both sides, edges do not
+    back = flip_normals(over, config)
+    np.testing.assert_array_equal(back.features, made.features)

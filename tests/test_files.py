@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from geomoe3d.errors import OutputError
-from geomoe3d.files import check_output, write_atomically
+from geomoe3d.files import check_output, write_atomically, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -121,6 +121,26 @@ def test_a_link_stays_a_link(tmp_path):
     write_atomically(tmp_path / "link.txt", text_writer("new"), force=True)
     assert (tmp_path / "link.txt").is_symlink()
     assert (tmp_path / "real.txt").read_text() == "new"
+
+
+def test_text_is_utf8_with_line_feeds_and_replaces_only_when_told(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "größer\r\n…\n", force=False)
+    assert path.read_bytes() == "größer\r\n…\n".encode()
+    with pytest.raises(OutputError, match=r"exists.*--force"):
+        write_text(path, "new", force=False)
+    write_text(path, "new", force=True)
+    assert path.read_text() == "new"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_text_that_cannot_be_encoded_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(UnicodeEncodeError):
+        write_text(path, "new \ud800", force=True)
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")

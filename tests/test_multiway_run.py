@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +17,18 @@ from scipy.spatial.transform import Rotation
 from small_scans import SETTINGS, UTM
 
 from geomoe3d import register_scans
-from geomoe3d.batch.store import JOURNAL_FILE
-from geomoe3d.clouds.io import load_points
+from geomoe3d.batch.folder import JOURNAL_FILE
+from geomoe3d.cli.multiway import command
+from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.config import load_config
-from geomoe3d.errors import InputError
+from geomoe3d.errors import ConfigError, DependencyError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse, make_transform, rotation_error_deg, transform_points
 from geomoe3d.journal import read_journal
+from geomoe3d.multiway.edges import Edge
+from geomoe3d.multiway.grouping import GroupingRules
 from geomoe3d.multiway.page import render_model_page
+from geomoe3d.multiway.report import _why_unplaced
+from geomoe3d.multiway.scans import Scan
 
 CONFIG = load_config(None, SETTINGS)
 
@@ -174,16 +182,104 @@ def test_the_command_places_and_exits_with_three(scanned_room, tmp_path):
         (["a.npy", "a.npy"], {}, "more than once"),
         (["a.npy", "b.npy"], {"pairs": "some"}, "choose auto, all or similar"),
         (["a.npy", "b.npy"], {"neighbors": 0}, "at least 1"),
+        (["a.npy", "b.npy"], {"merged_voxel_size": 0.0}, "must be positive"),
+        ("a.npy", {}, "at least 2 scans"),
+        (Path("none"), {}, "no file or folder 'none'"),
+        (None, {}, "scans must be paths of files or of folders, found None"),
+        (np.zeros((5, 3)), {}, "scan 1 must be the path .* found ndarray of shape .3,."),
+        (["a.npy", np.zeros((5, 3))], {}, "scan 2 must be the path .* found ndarray of shape .5, 3."),
         (["a.npy", "b.npy"], {}, "fewer than 2 scans can be used"),
     ],
 )
 def test_unusable_input_is_refused(tmp_path, monkeypatch, inputs, named, message):
     monkeypatch.chdir(tmp_path)
-    if inputs != ["."]:
+    if not isinstance(inputs, list) or inputs != ["."]:
         for name in ("a", "b"):
             (tmp_path / f"{name}.npy").write_bytes(b"broken")
     with pytest.raises(InputError, match=message):
         register_scans(inputs, tmp_path / "out", config=CONFIG, **named)
+    assert not (tmp_path / "out").exists()
+
+
+def everything(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def copied(model, tmp_path):
+    """A finished model of the test's own."""
+    shutil.copytree(model.folder, tmp_path / "copied")
+    return tmp_path / "copied"
+
+
+@pytest.mark.parametrize(
+    ("named", "kind", "message"),
+    [
+        ({"workers": 1000}, InputError, "1000 workers would take"),
+        ({"workers": 1, "scheduler": "tcp://127.0.0.1:1"}, InputError, "either workers or a scheduler"),
+        ({"scheduler": "tcp://127.0.0.1:1"}, DependencyError, "needs Dask"),
+        ({"cache": __file__}, OutputError, "is a file; described clouds are kept in a folder"),
+        ({"config": load_config(None, [*SETTINGS, "filter.name=nothing"])}, ConfigError, "unknown filter"),
+        ({"scans": ["scan_0.npy", "scan_9.ply"]}, InputError, "fewer than 2 scans can be used"),
+    ],
+)
+def test_what_is_refused_is_before_anything_is_removed(
+    scanned_room, copied, monkeypatch, named, kind, message
+):
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr("geomoe3d.workers.import_module", absent)
+    monkeypatch.setattr("geomoe3d.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
+    named = {"config": CONFIG, **named}
+    scans = [scanned_room[0] / name for name in named.pop("scans", ["scan_0.npy", "scan_1.npy"])]
+    before = everything(copied)
+    with pytest.raises(kind, match=message):
+        register_scans(scans, copied, fresh=True, **named)
+    assert everything(copied) == before
+    with pytest.raises(kind, match=message):
+        register_scans(scans, copied.with_name("new"), **named)
+    assert not copied.with_name("new").exists()
+
+
+def test_beginning_anew_removes_what_the_model_left_and_nothing_else(scanned_room, copied):
+    scans = [scanned_room[0] / f"scan_{k}.npy" for k in (0, 1)]
+    (copied / "group7.ply").write_bytes((copied / "group1.ply").read_bytes())
+    (copied / "notes.txt").write_text("mine")
+    (copied / "pairs" / "notes.txt").write_text("mine")
+    register_scans(scans, copied, config=CONFIG)  # what is its own it replaces unasked
+    assert (copied / "page.html").read_text().count("data-scan=") == 2
+    assert not (copied / "group7.ply").exists()
+    model = register_scans(scans, copied, config=CONFIG, fresh=True, page=False)
+    assert model.num_pairs == len(list(read_journal(copied / "pairs" / JOURNAL_FILE))) == 1
+    group = {f"group1.{suffix}" for suffix in ("tum.txt", "kitti.txt", "g2o", "ply")}
+    assert {path.name for path in copied.iterdir()} == {"poses.json", "pairs", "notes.txt", *group}
+    assert (copied / "pairs" / "notes.txt").read_text() == "mine"
+
+
+def test_the_cache_of_the_command_must_be_a_folder(scanned_room, tmp_path):
+    scans = scanned_room[0]
+    words = [sys.executable, "-m", "geomoe3d", "multiway", str(scans), str(tmp_path / "o")]
+    done = subprocess.run(
+        [*words, "--cache", str(scans / "scan_9.ply")],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=Path(__file__).parents[1],
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: '{scans / 'scan_9.ply'}' is a file; described clouds are kept in")
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_command_knows_the_defaults_without_what_computes():
+    code = "import sys, geomoe3d.cli.multiway; sys.exit('numpy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    given = {option.name: option.default for option in command.params}
+    wanted = {name: value.default for name, value in inspect.signature(register_scans).parameters.items()}
+    for name in ("pairs", "neighbors", "rounds"):
+        assert given[name] == wanted[name]
 
 
 def test_a_folder_that_holds_something_of_the_users_is_refused(scanned_room, tmp_path):
@@ -197,10 +293,65 @@ def test_a_folder_that_holds_something_of_the_users_is_refused(scanned_room, tmp
         register_scans([scans], out, config=CONFIG)
     with pytest.raises(InputError, match="is a file"):
         register_scans([scans], kept[1], config=CONFIG)
-    with pytest.raises(InputError, match="taken for a scan"):
-        register_scans([scans], scans, config=CONFIG)
+    for inputs in (scans, [scans], [scans / "scan_0.npy", scans / "scan_9.ply"]):
+        with pytest.raises(InputError, match="taken for a scan"):
+            register_scans(inputs, scans, config=CONFIG)
     assert sorted(out.iterdir()) == kept
     assert all(path.read_text() == "mine" for path in kept)
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("poses.json", '{"format": "of another program", "poses": []}'),
+        ("poses.json", "[1, 2]"),
+        ("poses.json", '{"format": "geomoe3d sc'),
+        ("page.html", "<html>mine</html>"),
+        ("pairs/results.jsonl", "mine"),
+        ("pairs/run.json", "{}"),
+    ],
+)
+def test_files_of_other_programs_are_refused(scanned_room, tmp_path, name, text, fresh):
+    folder, _ = scanned_room
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text(text)
+    if name == "poses.json":
+        (out / "group2.ply").write_text("mine")
+    before = everything(out)
+    with pytest.raises(InputError, match=rf"{name}' (is not of|does not describe) a (model|batch) of geomoe"):
+        register_scans([folder / "scan_0.npy", folder / "scan_1.npy"], out, config=CONFIG, fresh=fresh)
+    assert everything(out) == before
+
+
+def test_a_folder_of_other_scans_is_refused_and_one_of_notes_is_not(scanned_room, tmp_path):
+    folder, _ = scanned_room
+    scans = [folder / "scan_0.npy", folder / "scan_1.npy"]
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "table.csv").write_text("a,b\n1,x\n")
+    (tmp_path / "page.html").write_text("<html>mine</html>")
+    np.save(tmp_path / "row.npy", np.arange(7))
+    register_scans(scans, tmp_path, config=CONFIG, page=False)
+    assert (tmp_path / "page.html").read_text() == "<html>mine</html>"
+    for name in ("other.npy", "other.txt", "other.ply"):
+        if name == "other.ply":
+            (tmp_path / name).write_text("ply\n")
+        else:
+            save_points(tmp_path / name, np.random.default_rng(0).normal(size=(50, 3)))
+        before = everything(tmp_path)
+        with pytest.raises(InputError, match=rf"{name}'\): the merged cloud would be taken for a scan"):
+            register_scans(scans, tmp_path, config=CONFIG, page=False, fresh=True)
+        assert everything(tmp_path) == before
+        (tmp_path / name).unlink()
+
+
+def test_why_a_scan_is_not_placed_names_the_confidence_that_counts():
+    scans = [Scan(name, f"/{name}.ply") for name in "abc"]
+    edges = {pair: Edge(pair[1], pair[0], np.eye(4), 0.9, np.eye(6)) for pair in ((0, 2), (1, 2))}
+    rules = GroupingRules(1.0, 1.0, 1.0, 1.0, least_worth=float(np.log(3)))
+    survey = SimpleNamespace(unusable={}, edges=edges, outcomes=edges, scans=scans, rules=rules)
+    assert "its 2 pairs above 0.75 do not agree" in _why_unplaced(survey, 2)
 
 
 def test_files_of_the_users_beside_a_model_stay(scanned_room, tmp_path):

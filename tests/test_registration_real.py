@@ -9,9 +9,11 @@ import pytest
 
 from geomoe3d.cli.errors import run
 from geomoe3d.cli.register import command
+from geomoe3d.clouds.io import load_points
+from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import find_data_root, load_benchmark
 from geomoe3d.errors import InputError
-from geomoe3d.geometry.se3 import inverse, rotation_error_deg, translation_error
+from geomoe3d.geometry.se3 import inverse, rotation_error_deg, shift_frames, translation_error
 from geomoe3d.registration import Registrar
 
 pytestmark = pytest.mark.real_data
@@ -67,3 +69,22 @@ def test_fragments_of_different_scenes_are_not_accepted(data):
         result = registrar.register(kitchen / f"cloud_bin_{k}.ply", hotel / f"cloud_bin_{k}.ply")
         assert result.status != "ok"
         assert result.reasons
+
+
+def test_a_sensor_guessed_on_the_wrong_side_is_made_up_for(data):
+    pair = next(
+        p
+        for p in load_benchmark(data, "3DLoMatch")
+        if (p.scene, p.source_index, p.target_index) == ("sun3d-home_at-home_at_scan1_2013_jan_1", 17, 20)
+    )
+    clouds = [load_points(path).file_points for path in (pair.source, pair.target)]
+    middles = [points.mean(0) for points in clouds]
+    source, target = (points - middle for points, middle in zip(clouds, middles, strict=True))
+    truth = shift_frames(pair.T_target_source, -middles[0], -middles[1])
+    once = Registrar(load_config(None, ["second_look.flip=false"])).register(source, target)
+    assert once.status != "ok"
+    assert any("sensors stood is not known" in reason for reason in once.reasons)
+    result = Registrar().register(source, target)
+    assert result.status == "ok"
+    assert rotation_error_deg(result.T_target_source, truth) < 15
+    assert translation_error(result.T_target_source, truth) < 0.30

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.geometry.se3 import (
     inverse,
+    is_motion,
+    is_rotation,
     make_transform,
     project_to_so3,
     rotation_angle_deg,
@@ -113,6 +115,26 @@ def test_projection_is_the_nearest_rotation(kind: str) -> None:
 def test_projection_leaves_a_rotation_alone() -> None:
     for R in Rotation.random(20, random_state=6).as_matrix():
         np.testing.assert_allclose(project_to_so3(R), R, atol=1e-14)
+
+
+def test_rotations_and_motions_are_told_within_a_tolerance() -> None:
+    rng = np.random.default_rng(8)
+    T = random_motion(rng)
+    R = T[:3, :3]
+    assert is_rotation(R, 1e-12)
+    assert not is_rotation(R @ np.diag([1.0, 1.0, -1.0]), 0.01)
+    assert not is_rotation(np.zeros((3, 3)), 0.01)
+    stretched = R @ np.diag([1.005, 1.0, 1.0])  # R^T R is 0.010025 off
+    assert is_rotation(stretched, 0.0101)
+    assert not is_rotation(stretched, 0.01)
+    assert is_motion(T, 1e-12)
+    for broken in (
+        T[:3],
+        np.full((4, 4), np.nan),
+        T * [[1.0], [1.0], [1.0], [1.00001]],
+        make_transform(2 * R, R[0]),
+    ):
+        assert not is_motion(broken, 0.01)
 
 
 @given(SEEDS)

@@ -14,7 +14,9 @@ import pytest
 import torch
 from training_runs import TREE, assert_same_run, environment, write_yaml
 
+from geomoe3d.errors import ConfigError
 from geomoe3d.training.checkpoint import load_checkpoint
+from geomoe3d.training.distributed import Process, choose_device
 
 
 @pytest.mark.slow
@@ -111,3 +113,20 @@ def test_torchrun_trains_and_resumes(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         assert done.stdout.count("best at step") == 1
     assert load_checkpoint(tmp_path / "run" / "last.pt")["step"] == 4
+
+
+@pytest.mark.parametrize("name", ["gpu", "mps", "cuda", "cuda:3"])
+def test_a_device_that_is_not_there_is_refused_by_name(name, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match=f"device is '{name[:4]}"):
+        choose_device(name, Process())
+
+
+def test_cuda_alone_means_the_gpu_of_the_process(monkeypatch):
+    chosen = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    for name in ("cuda", "auto"):
+        assert choose_device(name, Process(rank=1, world=2, local_rank=1)) == torch.device("cuda:1")
+    assert chosen == [torch.device("cuda:1")] * 2
+    assert choose_device("cpu", Process()) == torch.device("cpu")

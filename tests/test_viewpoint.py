@@ -33,8 +33,25 @@ def test_one_extent_is_the_limit(distance: float, believed: bool) -> None:
     """The extent of the unit faces is their diagonal, 2 sqrt(3) = 3.46."""
     corners = np.array([[x, y, z] for x in (0.0, 2) for y in (0, 2) for z in (0, 2)])
     for sign in (1, -1):
-        cloud = PointCloud((corners + distance * np.eye(3)[0]) * sign)
+        cloud = PointCloud((corners + np.array([distance, -0.7, -0.6])) * sign)
         assert (find_viewpoints(cloud, cloud, "auto")[0] is not None) == believed
+
+
+@pytest.mark.parametrize("shift", ["mean", "middle", "corner", "mean, then thinned"])
+def test_no_sensor_is_believed_where_a_cloud_was_plainly_moved(shift: str) -> None:
+    rng = np.random.default_rng(3)
+    seen, _ = seen_from(np.array([0.5, 0.5, 1.6]), rng)
+    points = seen - [0.5, 0.5, 1.6]
+    low, high = points.min(0), points.max(0)
+    moved = points - {"middle": (low + high) / 2, "corner": low}.get(shift, points.mean(0))
+    if "thinned" in shift:
+        moved = moved[np.unique(np.floor(moved / 0.05).astype(int), axis=0, return_index=True)[1]]
+    good, bad, far = PointCloud(points), PointCloud(moved), PointCloud(moved - 2.0, origin=np.full(3, 2.0))
+    assert find_viewpoints(good, good, "auto")[0] is not None
+    for cloud in (bad, far):  # whatever was taken off at loading
+        assert find_viewpoints(good, cloud, "auto") == (None, None)
+        assert find_viewpoints(cloud, good, "auto") == (None, None)
+    assert find_viewpoints(bad, bad, "origin")[0] is not None
 
 
 def test_bare_correspondences_have_their_sensors_at_the_origins_that_are_near() -> None:

@@ -30,6 +30,11 @@ def worker_bytes(rows: Iterable[PairRow]) -> int:
     return int(_BASE_BYTES + largest)
 
 
+def worker_bytes_of_any(paths: Iterable[str]) -> int:
+    """The same for whichever two of some files: the two largest."""
+    return int(_BASE_BYTES + sum(sorted(map(_loaded_bytes, paths))[-2:]))
+
+
 def choose_workers(wanted: int | None, each: int) -> tuple[int, int | None]:
     """How many local processes to start, and the limit in bytes that each is held to.
 

@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.batch.folder import PAGE_MARK
 from geomoe3d.batch.store import Outcome
 from geomoe3d.batch.table import PairRow
 from geomoe3d.clouds.io import load_points
 from geomoe3d.errors import GeoMoE3DError
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
@@ -61,8 +62,7 @@ def save_batch_page(path: Path, rows: Sequence[PairRow], outcomes: Sequence[Outc
         OutputError: the page cannot be written.
     """
     _points.cache_clear()  # files may have changed since the last page of this process
-    text = render_batch_page(rows, outcomes)
-    write_atomically(path, lambda temporary: _put(temporary, text), force=True)
+    write_text(path, render_batch_page(rows, outcomes), force=True)
 
 
 def render_batch_page(rows: Sequence[PairRow], outcomes: Sequence[Outcome]) -> str:
@@ -86,6 +86,7 @@ def render_batch_page(rows: Sequence[PairRow], outcomes: Sequence[Outcome]) -> s
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"{PAGE_MARK}\n"
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
         "style-src 'unsafe-inline'\">\n"
         f"<title>{len(rows):,} pairs</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
@@ -139,7 +140,3 @@ def _points(path: str) -> tuple[FloatArray, FloatArray]:
 
 def _word(status: str) -> str:
     return STATUS_WORDS.get(status, "not registered")
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")

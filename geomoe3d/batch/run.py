@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
+from geomoe3d.batch.folder import (
+    PAGE_FILE,
+    TRANSFORMS_FOLDER,
+    check_can_be_folder,
+    check_extras,
+    write_transforms,
+)
 from geomoe3d.batch.memory import choose_workers, gibibytes, worker_bytes
-from geomoe3d.batch.store import BatchStore, Outcome, remove_batch
+from geomoe3d.batch.store import BatchStore, Outcome
 from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
-from geomoe3d.batch.task import Settings, Task, as_record, register_pair
+from geomoe3d.batch.task import Settings, Task, as_record, make_ready, register_pair
+from geomoe3d.clouds.description_cache import CACHE_VARIABLE
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.filters.base import resolved
-from geomoe3d.transform_files import has_transform, save_transform
+from geomoe3d.transform_files import has_transform
 from geomoe3d.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 ALL_THAT_FIT = 0
@@ -65,16 +73,32 @@ class Labour:
     scheduler: str | None = None
     cache: str | None = None
 
-    def pool(self, rows: list[PairRow], say: Callable[[str], None]) -> Pool:
+    def check(self) -> None:
+        """Refuse what needs no look at the pairs.
+
+        Raises:
+            InputError: workers and a scheduler at once.
+            OutputError: the cache is no folder.
+        """
+        if self.scheduler is not None and self.workers is not None:
+            raise InputError("give either workers or a scheduler: a cluster has its own workers")
+        cache = self.cache
+        if cache is None and self.scheduler is None:  # the workers of a cluster have their own
+            cache = os.environ.get(CACHE_VARIABLE)
+        if cache:
+            check_can_be_folder(Path(cache), "described clouds are kept in a folder: give one, or none")
+
+    def pool(self, each: int, say: Callable[[str], None]) -> Pool:
         """Where to run, after saying how much memory it takes.
+
+        Args:
+            each: bytes that a worker takes, from `geomoe3d.batch.memory`.
+            say: called with a sentence.
 
         Raises:
             InputError, DependencyError: as the pools of `geomoe3d.workers` and `choose_workers`.
         """
-        each = worker_bytes(rows)
         if self.scheduler is not None:
-            if self.workers is not None:
-                raise InputError("give either workers or a scheduler: a cluster has its own workers")
             pool = DaskPool(self.scheduler)
             say(f"{pool.describe()}; the largest pair takes about {gibibytes(each)} of a worker")
             return pool
@@ -85,6 +109,23 @@ class Labour:
         held = "" if limit is None else f", each held to {gibibytes(limit)}"
         say(f"{workers} worker{'s' * (workers > 1)} of about {gibibytes(each)}{held}")
         return ProcessPool(workers, threads=1, memory_limit=limit)  # the same bytes for any number of workers
+
+
+def try_out(pool: Pool, settings: Settings) -> None:
+    """Let a worker make ready, so that what it refuses is known before anything is written or removed.
+
+    Raises:
+        OutputError: it died. What it refuses passes through, see `geomoe3d.batch.task.make_ready`.
+    """
+    try:
+        pool.open().submit(make_ready, settings).result()
+    except Exception as error:
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
+            raise
+        raise OutputError(
+            "a worker died as it began, so nothing was done: it may lack memory (give fewer workers), and a "
+            'script that asks for workers needs `if __name__ == "__main__":`'
+        ) from None
 
 
 def register_pairs(
@@ -117,34 +158,36 @@ def register_pairs(
         scheduler: address of a Dask scheduler instead; its workers must see the files under the same paths.
         transforms: write ``transforms/<id>.txt`` for every pair that has a transform.
         page: write ``page.html`` with a picture of every pair.
-        fresh: forget what the folder holds of an earlier batch.
+        fresh: forget what the folder holds of an earlier batch; not before all that can be refused is known.
         retry: do the pairs again that could not be registered.
         cache: folder of described clouds; None: the user's own; "": none.
         progress: called with (pairs done, pairs in all).
         say: called with a sentence on workers and memory before the work begins.
 
     Raises:
-        InputError: a table that cannot be used, or a folder with results of another configuration.
+        InputError: a table that cannot be used, more workers than fit, or a folder with results of another
+            configuration or with files of the user's under the names of a batch's own.
         DependencyError: Dask is not installed, or a worker has other versions.
-        OutputError: the folder cannot be written, or another process is writing it.
+        OutputError: the folder cannot be written, or another process is writing it; or the cache is a file.
     """
     is_table = isinstance(pairs, (str, os.PathLike))
     rows = read_pairs(pairs) if is_table else as_rows(pairs)  # type: ignore[arg-type]
     folder = Path(out)
-    if fresh:
-        remove_batch(folder)
     config = resolved(config)
-    store = BatchStore(folder, config)
     labour = Labour(workers, scheduler, cache)
+    labour.check()
+    store = BatchStore(folder, config, fresh=fresh)
+    check_extras(folder, [row.id for row in rows], transforms=transforms, page=page)
     records, kept = work(rows, store, config, labour, retry, progress, say)
     outcomes = tuple(store.outcome(records[row.id]) for row in rows)
     store.write_results(records[row.id] for row in rows)
     if transforms:
-        write_transforms(folder / "transforms", outcomes)
+        found = ((o.id, o.result) for o in outcomes if o.result is not None and has_transform(o.result))
+        write_transforms(folder / TRANSFORMS_FOLDER, found)
     if page:
         from geomoe3d.batch.page import save_batch_page
 
-        save_batch_page(folder / "page.html", rows, outcomes)
+        save_batch_page(folder / PAGE_FILE, rows, outcomes)
     return BatchReport(folder, outcomes, len(rows) - kept, kept)
 
 
@@ -157,43 +200,38 @@ def work(
     progress: Callable[[int, int], None] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, dict[str, Any]], int]:
-    """Records of all rows by id, those that were missing made now, and how many were there."""
+    """Records of all rows by id, those that were missing made now, and how many were there.
+
+    Where nothing has been written yet, all that can be refused is before anything is written or removed.
+    """
     wanted = {row.id: row.fingerprint() for row in rows}
-    with store.journal() as journal:
-        records = store.finished(wanted, with_errors=not retry)
-        kept = len(records)
-        if progress is not None:
-            progress(kept, len(rows))
-        missing = [row for row in rows if row.id not in records]
-        if not missing:
-            return records, kept
-        pool = labour.pool(missing, say or (lambda text: None))
-        settings = Settings.of(config, labour.cache)
-        tasks = (Task(row, wanted[row.id], settings) for row in missing)
-        for task, made in run_surviving(pool, register_pair, tasks):
-            name = task.row.id
-            if isinstance(made, WorkerDied):
-                made = as_record(name, task.fingerprint, None, made.reason)
-            journal.append(made)
-            records[name] = made
-            if progress is not None:
-                progress(len(records), len(rows))
-    return records, kept
-
-
-def write_transforms(folder: Path, outcomes: Iterable[Outcome]) -> None:
-    """One text file per outcome that has a transform, named by its id (odd characters as %XX)."""
+    settings = Settings.of(config, labour.cache)
+    say = say or (lambda text: None)
+    pool: Pool | None = None
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
-    for outcome in outcomes:
-        result = outcome.result
-        if result is not None and has_transform(result):
-            names = f"SOURCE ({result.source.name}) into TARGET ({result.target.name})"
-            comments = [
-                f"maps {names}: p_target = R p_source + t",
-                f"status {result.status}, confidence {result.confidence:.4f}",
-            ]
-            name = quote(outcome.id, safe=" +=,@")
-            save_transform(folder / f"{name}.txt", result.T_target_source, comments, force=True)
+        if store.begins:
+            pool = labour.pool(worker_bytes(rows), say)
+            try_out(pool, settings)
+            store.begin()
+        with store.journal() as journal:
+            records = store.finished(wanted, with_errors=not retry)
+            kept = len(records)
+            if progress is not None:
+                progress(kept, len(rows))
+            missing = [row for row in rows if row.id not in records]
+            if not missing:
+                return records, kept
+            pool = pool or labour.pool(worker_bytes(missing), say)
+            tasks = (Task(row, wanted[row.id], settings) for row in missing)
+            for task, made in run_surviving(pool, register_pair, tasks):
+                name = task.row.id
+                if isinstance(made, WorkerDied):
+                    made = as_record(name, task.fingerprint, None, made.reason)
+                journal.append(made)
+                records[name] = made
+                if progress is not None:
+                    progress(len(records), len(rows))
+        return records, kept
+    finally:
+        if pool is not None:
+            pool.close()

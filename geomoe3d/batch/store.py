@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -16,16 +17,23 @@ from pathlib import Path
 from typing import Any
 
 from geomoe3d.answer import library_versions
+from geomoe3d.batch.folder import (
+    FORMAT,
+    JOURNAL_FILE,
+    RESULTS_FILE,
+    RUN_FILE,
+    check_can_be_folder,
+    foreign,
+    read_identity,
+    remove_batch,
+)
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import FormatError, InputError, OutputError
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_atomically, write_text
 from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, find_weights
 from geomoe3d.journal import Journal, read_journal
 from geomoe3d.provenance import hardware, source_commit
 from geomoe3d.result import RegistrationResult
-
-RUN_FILE, JOURNAL_FILE, RESULTS_FILE = "run.json", "journal.jsonl", "results.jsonl"
-_FORMAT = "geomoe3d batch 1"
 
 
 @dataclass(frozen=True)
@@ -54,50 +62,73 @@ class Outcome:
 
 
 class BatchStore:
-    """The folder of one batch.
+    """The folder of one batch; looked at when made, written from `begin` on.
 
     Args:
-        folder: made if missing.
+        folder: there or to be made.
         config: of all its pairs.
+        fresh: what it holds of an earlier batch does not count, and goes when this one begins.
+
+    Attributes:
+        folder: as given.
+        begins: whether nothing of this batch has been written yet.
 
     Raises:
-        InputError: the folder holds a batch of another configuration or version; names what differs.
+        InputError: the folder holds a batch of another configuration or version (names what differs), or
+            files of the user's under the names of a batch's own.
         OutputError: the folder cannot be made or written.
         FormatError: a file in it is damaged.
+        CheckpointError: the filter's weights are missing.
     """
 
-    def __init__(self, folder: Path, config: RegistrationConfig) -> None:
+    def __init__(self, folder: Path, config: RegistrationConfig, *, fresh: bool = False) -> None:
         self.folder = folder
+        self._fresh = fresh
         self._shared: dict[str, Any] = {
             "config": config.model_dump(mode="json"),
             "versions": library_versions(),
             "seed": config.seed,
         }
-        identity = {"format": _FORMAT, **self._shared, "weights": _weights_hash(config)}
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except FileExistsError:
-            raise OutputError(f"'{folder}' is a file; results are written into a folder") from None
-        except OSError as error:
-            raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
-        path = folder / RUN_FILE
-        if path.is_file():
-            differing = _differences(_read_identity(path), identity)
-            if differing:
-                raise InputError(
-                    f"'{folder}' holds results of another batch; they differ in {'; '.join(differing)}. "
-                    "Give another folder, or --fresh (fresh=True) to begin anew"
-                )
+        self._identity = {"format": FORMAT, **self._shared, "weights": _weights_hash(config)}
+        there = check_can_be_folder(folder, "results are written into a folder")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise OutputError(f"cannot write into '{folder}': no right to write into '{there}'")
+        stored = read_identity(folder)
+        self.begins = fresh or stored is None
+        for path in (folder / JOURNAL_FILE, folder / RESULTS_FILE):
+            if path.exists() and (stored is None or not path.is_file()):
+                raise InputError(foreign(path))
+        differing = [] if stored is None or fresh else _differences(stored, self._identity)
+        if differing:
+            raise InputError(
+                f"'{folder}' holds results of another batch; they differ in {'; '.join(differing)}. "
+                "Give another folder, or --fresh (fresh=True) to begin anew"
+            )
+
+    def begin(self) -> None:
+        """Make the folder, without what is left of an earlier batch where this one is fresh.
+
+        Does nothing where the batch was begun before.
+
+        Raises:
+            OutputError: it cannot be written, or another process is writing it.
+        """
+        if not self.begins:
             return
+        if self._fresh:
+            remove_batch(self.folder)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make the folder '{self.folder}': {error.strerror}") from None
         text = {
-            "identity": identity,
+            "identity": self._identity,
             "commit": source_commit(),
             "hardware": hardware(),
             "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         }
-        write_atomically(
-            path, lambda temporary: _put(temporary, json.dumps(text, indent=2) + "\n"), force=False
-        )
+        write_text(self.folder / RUN_FILE, json.dumps(text, indent=2) + "\n", force=False)
+        self.begins = False
 
     def journal(self) -> Journal:
         """Open for appending; keeps a second process out."""
@@ -111,6 +142,8 @@ class BatchStore:
             with_errors: False leaves out the pairs that could not be registered.
         """
         found: dict[str, dict[str, Any]] = {}
+        if self.begins:
+            return found
         for record in read_journal(self.folder / JOURNAL_FILE):
             name = str(record.get("id"))
             if name in wanted and record.get("fingerprint") == wanted[name]:
@@ -150,35 +183,12 @@ class BatchStore:
         return path
 
 
-def remove_batch(folder: Path) -> None:
-    """Delete what a batch keeps of itself; nothing else in the folder is touched.
-
-    Raises:
-        OutputError: a file cannot be removed, or another process is writing the journal.
-    """
-    if (folder / JOURNAL_FILE).is_file():
-        Journal(folder / JOURNAL_FILE).close()  # refused while another process holds it
-    for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE):
-        try:
-            (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot remove '{folder / name}': {error.strerror}") from None
-
-
 def _weights_hash(config: RegistrationConfig) -> str | None:
     """Hash of the filter's weights, if it has any: another training must not mix with the old."""
     if config.filter.name != "geomoe":
         return None
     path = find_weights(config.filter.weights or DEFAULT_WEIGHTS)
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-
-
-def _read_identity(path: Path) -> dict[str, Any]:
-    try:
-        identity = json.loads(path.read_text(encoding="utf-8"))["identity"]
-        return dict(identity)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"'{path}' does not describe a batch: {error!r}") from None
 
 
 def _differences(stored: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
@@ -198,7 +208,3 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             rows[prefix + key] = json.dumps(value)
     return rows
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

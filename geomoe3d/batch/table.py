@@ -11,7 +11,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -27,7 +27,11 @@ from geomoe3d.types import FloatArray
 MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
 """Sixteen columns of an initial value, row by row."""
 
+_COLUMNS = ("source", "target", "id", "initial", *MATRIX_COLUMNS)
+_NEARLY = 0.82  # of difflib: one letter wrong, missing or exchanged; 'source_id' and 'ids' have less
+
 PairLike = Sequence[Any]
+_EXPECTED = "(source, target) or (source, target, first guess)"
 
 
 @dataclass(frozen=True)
@@ -63,12 +67,13 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
     Separated by comma, semicolon or tab; relative paths are relative to the file. ``id`` is made of source
     and target where it is not given. A first guess is the path of a transform file in the column
     ``initial``, or 16 numbers in the columns T00 T01 ... T33; empty cells mean none. Other columns are
-    ignored.
+    ignored, but not those whose name is nearly one of these.
 
     Raises:
         InputError: no such file, no rows, a duplicate id, a row without source or target, or a first guess
             that is no rigid motion; names the line.
-        FormatError: no header with the two columns, or no text.
+        FormatError: no header with the two columns, a name that is nearly a known one, a row with more cells
+            than the header, or no text.
     """
     path = Path(path)
     try:
@@ -88,6 +93,12 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
     try:
         for cells in reader:
             where = f"'{path}' line {reader.line_num}"
+            surplus = [cell for cell in cells.pop(None, []) if cell.strip()]
+            if surplus:
+                raise FormatError(
+                    f"{where} has more cells than the {len(columns)} that the first line names, the first "
+                    f"of them '{surplus[0]}'; put a cell that holds the separator '{separator}' in quotes"
+                )
             values = {key: (cells[key] or "").strip() for key in columns}
             if any(values.values()):
                 rows.append(_row(values, folder, where))
@@ -103,23 +114,46 @@ def as_rows(pairs: Iterable[PairLike | PairRow]) -> list[PairRow]:
     Raises:
         InputError: none, a duplicate, or something else than paths; a batch sends paths to its workers.
     """
+    numbers = getattr(getattr(pairs, "dtype", None), "kind", "O") not in "OSU"  # an array may hold paths too
+    if numbers or isinstance(pairs, (bytes, Mapping)) or not isinstance(pairs, Iterable):
+        raise InputError(
+            f"pairs must be a CSV file or a list of {_EXPECTED}, found {kind_of(pairs)}; clouds in memory go "
+            "through Registrar.register_many"
+        )
     rows = []
     for number, pair in enumerate(pairs, start=1):
         where = f"pair {number}"
         if isinstance(pair, PairRow):
             rows.append(pair)
             continue
-        if isinstance(pair, str) or not 2 <= len(pair) <= 3:
-            raise InputError(f"{where}: expected (source, target) or (source, target, first guess)")
-        source, target = pair[0], pair[1]
-        if not all(isinstance(side, (str, os.PathLike)) for side in (source, target)):
-            raise InputError(f"{where}: source and target must be paths of files")
+        parts: Any = pair
+        if isinstance(parts, np.ndarray):
+            parts = parts.tolist()
+        if not isinstance(parts, Sequence) or isinstance(parts, (str, bytes)) or not 2 <= len(parts) <= 3:
+            raise InputError(f"{where}: expected {_EXPECTED}, found {kind_of(pair)}")
+        source, target = parts[0], parts[1]
+        for side in (source, target):
+            if not isinstance(side, (str, os.PathLike)):
+                raise InputError(
+                    f"{where}: source and target must be paths of files, found {kind_of(side)}; clouds in "
+                    "memory go through Registrar.register_many"
+                )
         initial = None
-        if len(pair) == 3 and pair[2] is not None:
-            initial = _motion(pair[2], where)
+        if len(parts) == 3 and parts[2] is not None:
+            initial = _motion(parts[2], where)
         name = f"{os.fspath(source)}+{os.fspath(target)}"
         rows.append(PairRow(name, str(Path(source).resolve()), str(Path(target).resolve()), initial))
     return check_rows(rows, [f"pair {number}" for number in range(1, len(rows) + 1)], "the list of pairs")
+
+
+def kind_of(value: Any) -> str:
+    """What somebody gave instead of a path, in a few words."""
+    if value is None or isinstance(value, str):
+        return repr(value)
+    kind = type(value).__name__
+    if getattr(value, "shape", ()):
+        return f"{kind} of shape {tuple(value.shape)}"
+    return f"{kind} of {len(value)}" if isinstance(value, Sized) else f"{kind} {value!r}"
 
 
 def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow]:
@@ -144,14 +178,23 @@ def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow
 def _check_columns(path: Path, columns: list[str]) -> None:
     if not any(columns):
         raise InputError(f"'{path}' is empty; its first line must name the columns source and target")
-    for wanted in ("source", "target"):
-        if columns.count(wanted) != 1:
+    for wanted in _COLUMNS:
+        count = columns.count(wanted)
+        if count > 1 or (count == 0 and wanted in ("source", "target")):
             close = get_close_matches(wanted, columns, n=1)
             hint = f"; is '{close[0]}' meant?" if close and close[0] != wanted else ""
-            problem = "no column" if wanted not in columns else "more than one column"
+            problem = "more than one column" if count else "no column"
             raise FormatError(
                 f"'{path}' has {problem} '{wanted}' among {', '.join(columns)}{hint}; the first line must "
                 "name source and target, and may name id, initial, or T00 to T33"
+            )
+    known = {name.casefold(): name for name in _COLUMNS}
+    for name in columns:
+        close = get_close_matches(name.casefold(), known, n=1, cutoff=_NEARLY)
+        if close and name not in _COLUMNS:
+            raise FormatError(
+                f"'{path}' has the column '{name}', which is nearly '{known[close[0]]}'; name it so, or "
+                "give a column that is to be ignored a name of its own"
             )
     present = [name for name in MATRIX_COLUMNS if name in columns]
     if present and len(present) < 16:

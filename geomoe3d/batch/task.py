@@ -73,6 +73,16 @@ def register_pair(task: Task) -> dict[str, Any]:
     return as_record(row.id, task.fingerprint, result, error)
 
 
+def make_ready(settings: Settings) -> None:
+    """Have the registrar here that the tasks will need.
+
+    Raises:
+        ConfigError, CheckpointError, DependencyError: as `Registrar`, or this worker's libraries are other
+            than those of the process that asks.
+    """
+    _registrar(settings)
+
+
 def as_record(
     name: str, fingerprint: str, result: RegistrationResult | None, error: str | None
 ) -> dict[str, Any]:

@@ -106,7 +106,7 @@ def table(report: BatchReport) -> str:
         lines.append("")
     width = min(40, max((len(outcome.id) for outcome in doubtful[:_SHOWN]), default=0))
     for outcome in doubtful[:_SHOWN]:
-        reason = outcome.error if outcome.result is None else "; ".join(outcome.result.reasons[-1:])
+        reason = outcome.error if outcome.result is None else "; ".join(outcome.result.reasons[:1])
         name = outcome.id if len(outcome.id) <= width else "…" + outcome.id[-(width - 1) :]
         lines.append(f"  {name:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
     if len(doubtful) > _SHOWN:

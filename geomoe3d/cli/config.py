@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
 from geomoe3d.cli.errors import HELP, traceback_option
@@ -22,15 +20,11 @@ def command(source: str | None, assignments: tuple[str, ...], out: str | None, f
     """
     from geomoe3d.config import load_config
     from geomoe3d.config_text import commented_yaml
-    from geomoe3d.files import write_atomically
+    from geomoe3d.files import write_text
 
     text = commented_yaml(load_config(source, list(assignments)))
     if out is None:
         click.echo(text, nl=False)
         return
-
-    def write(path: Path) -> None:
-        path.write_text(text, encoding="utf-8")
-
-    write_atomically(out, write, force=force)
+    write_text(out, text, force=force)
     click.echo(out)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 
 if TYPE_CHECKING:
     from geomoe3d.multiway.model import SceneModel
@@ -18,14 +19,17 @@ _SHOWN = 20
 @click.command(context_settings=HELP, short_help="Place many scans in one model.")
 @click.argument("inputs", metavar="SCANS... OUT", nargs=-1, required=True)
 @click.option(
-    "--pairs", metavar="WHICH", default="auto", help="all, similar, or auto: all for up to 30 scans."
+    "--pairs",
+    metavar="WHICH",
+    default="auto",
+    help=f"all, similar, or auto: all for up to {ALL_PAIRS_UP_TO} scans.",
 )
 @click.option(
     "--neighbors",
     type=click.IntRange(1),
-    default=10,
+    default=NEIGHBORS,
     metavar="N",
-    help="Pairs proposed per scan and round. [10]",
+    help=f"Pairs proposed per scan and round. [{NEIGHBORS}]",
 )
 @click.option(
     "--model-voxel-size", type=float, metavar="LENGTH", help="Of the merged cloud. [that of the scans]"
@@ -33,9 +37,9 @@ _SHOWN = 20
 @click.option(
     "--rounds",
     type=click.IntRange(0),
-    default=3,
+    default=MOST_ROUNDS,
     metavar="N",
-    help="Of further pairs, where scans are loose. [3]",
+    help=f"Of further pairs, where scans are loose. [{MOST_ROUNDS}]",
 )
 @click.option(
     "--workers",

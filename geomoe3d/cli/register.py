@@ -37,6 +37,7 @@ class _Outputs:
 @click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [auto]")
 @click.option("--weights", metavar="FILE", help="Trained weights of the filter geomoe (.safetensors).")
 @click.option("--estimator", metavar="NAME", help="consensus, ransac or svd. [consensus]")
+@click.option("--initial", metavar="FILE", help="A first guess (.txt, .npy, .json), verified, not trusted.")
 @click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
 @click.option("--output", metavar="FILE", help="Write the transform: .txt, .npy, or .json (whole result).")
@@ -59,6 +60,7 @@ def command(
     filter_name: str | None,
     weights: str | None,
     estimator: str | None,
+    initial: str | None,
     inverse: bool,
     as_json: bool,
     output: str | None,
@@ -98,14 +100,16 @@ def command(
     with stdout_to_stderr(), stage_display(quiet) as stage:
         stage("start")  # importing the libraries below takes a second
         from geomoe3d.registration import Registrar
+        from geomoe3d.transform_files import load_transform
 
+        guess = None if initial is None else load_transform(initial)
         registrar = Registrar(config)
         explanation: Explanation | None = None
         if picture is not None or page is not None or show:
-            explanation = registrar.explain(source, target, progress=stage)
+            explanation = registrar.explain(source, target, initial=guess, progress=stage)
             result = explanation.result
         else:
-            result = registrar.register(source, target, progress=stage)
+            result = registrar.register(source, target, initial=guess, progress=stage)
     try:
         with stdout_to_stderr(), stage_display(quiet) as stage:
             _write(outputs, result, explanation, source, inverse, force, stage)
@@ -144,7 +148,7 @@ def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> N
 
     wanted = (
         ("--output", outputs.transform, TRANSFORM_SUFFIXES),
-        ("--aligned", outputs.aligned, (*WRITABLE_SUFFIXES, *WRITABLE_MESH_SUFFIXES)),
+        ("--aligned", outputs.aligned, tuple(dict.fromkeys((*WRITABLE_SUFFIXES, *WRITABLE_MESH_SUFFIXES)))),
         ("--picture", outputs.picture, FORMATS),
         ("--page", outputs.page, (".html", ".htm")),
     )

@@ -38,3 +38,8 @@ def describe(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
     features = np.where(np.isfinite(features), features, np.float32(0))
     features /= np.linalg.norm(features, axis=1, keepdims=True) + np.float32(1e-6)
     return replace(cloud, features=np.ascontiguousarray(features))
+
+
+def flip_normals(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
+    """The cloud as if its sensor had stood on the other side of every surface: described anew, no sensor."""
+    return describe(replace(cloud, normals=-cloud.normals, viewpoint=None), config)

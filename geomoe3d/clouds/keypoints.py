@@ -28,7 +28,7 @@ class Surface:
     Attributes:
         points: (n, 3) distinct points.
         normals: (n, 3) unit normals turned to the sensor, if it is known.
-        planarity: (n,) in [0, 1]; 1 on a plane.
+        planarity: (n,) in [0, 1]; 1 where the nearest points lie in a plane (or on a line).
         tree: k-d tree of the points.
         view: what the sensor saw, or None.
         viewpoint: (3,) or None.

@@ -33,7 +33,7 @@ class CheckReport:
 
     Attributes:
         root: the folder.
-        layout: one of `collection.LAYOUTS`.
+        layout: as in `Collection`.
         num_scenes: scenes with fragments.
         num_fragments: fragment files.
         num_pairs: group -> listed pairs.

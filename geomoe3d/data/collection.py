@@ -35,7 +35,6 @@ from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
 from geomoe3d.types import FloatArray, PointCloud
 
-LAYOUTS = ("benchmark", "evaluation", "archive", "predator", "posed")
 _CLOUD_PATTERN = "cloud_bin_*.ply"
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npy", ".npz", ".xyz", ".las", ".laz", ".e57", ".pth")
 
@@ -67,7 +66,7 @@ class Collection:
 
     Attributes:
         root: the folder.
-        layout: one of `LAYOUTS`.
+        layout: the name that `open_collection` has for what it found.
         fragments: scene -> fragment files, in order of their number.
         pairs: all listed pairs, group by group.
         problems: one sentence per thing that is missing or broken, with the file's name.

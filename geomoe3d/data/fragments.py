@@ -159,7 +159,7 @@ def fuse_run(
 
 
 def relate(
-    clouds: list[FloatArray], poses: list[FloatArray], min_overlap: float, grid: float = 0.025
+    clouds: list[FloatArray], poses: list[FloatArray], min_overlap: float, grid: float = OVERLAP_GRID
 ) -> tuple[PairTable, dict[tuple[int, int], float]]:
     """Entries of gt.log, and the overlap of every pair i < j that has any.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from geomoe3d.data.statistics import BANDS
 from geomoe3d.data.synthesize import SynthesisReport
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 
 
 def report_text(report: SynthesisReport) -> str:
@@ -52,9 +52,4 @@ def write_report(report: SynthesisReport, path: Path) -> None:
     Raises:
         OutputError: the disk refuses.
     """
-    text = report_text(report)
-    write_atomically(path, lambda temporary: _put(temporary, text), force=True)
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_text(path, report_text(report), force=True)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.geometry.se3 import make_transform, project_to_so3
+from geomoe3d.geometry.se3 import is_rotation, make_transform, project_to_so3
 from geomoe3d.types import Float32Array, FloatArray
 
 CONVENTIONS = ("7scenes", "tum", "plain")
@@ -203,7 +203,7 @@ def _check_pose(values: FloatArray, name: str, skipped: list[str]) -> FloatArray
         skipped.append(f"{name}: the pose is not finite")
         return None
     R = values[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(R) < 0:
+    if not is_rotation(R, _MAX_SKEW):
         skipped.append(f"{name}: the pose holds no rotation (det {np.linalg.det(R):.3f})")
         return None
     return make_transform(project_to_so3(R), np.array(values[:3, 3]))
@@ -280,8 +280,11 @@ def _tum(folder: Path, skipped: list[str]) -> list[Frame]:
             )
             continue
         row = poses[near]
-        if not np.isfinite(row).all() or not row[4:].any():
+        if not np.isfinite(row).all():
             skipped.append(f"{path.name}: the pose is not finite")
+            continue
+        if not row[4:].any():
+            skipped.append(f"{path.name}: the pose holds no rotation (its quaternion is zero)")
             continue
         frames.append(Frame(path, make_transform(Rotation.from_quat(row[4:]).as_matrix(), row[1:4])))
     return frames

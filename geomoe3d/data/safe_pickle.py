@@ -22,7 +22,6 @@ _ALLOWED = {
     ("numpy", "ndarray"): np.ndarray,
     ("numpy", "dtype"): np.dtype,
     ("collections", "OrderedDict"): OrderedDict,
-    ("_codecs", "encode"): None,
     ("builtins", "bytearray"): bytearray,
     ("builtins", "set"): set,
 }

@@ -1,8 +1,8 @@
 """The room of the sample pair: boxes and cylinders with a plain colour each.
 
-Four by three and a half metres with table, chairs, sofa, shelf, sideboard, lamp, plant and clutter. The
-furniture stands fast; the clutter is drawn from a generator. No wall and no piece repeats another, so the
-room has no symmetry. Milliseconds.
+4.4 by 3.8 metres with table, chairs, sofa, shelf, sideboard, lamp, plant and clutter. The furniture stands
+fast; the clutter is drawn from a generator. No wall and no piece repeats another, so the room has no
+symmetry. Milliseconds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def _draw(rng: np.random.Generator, low: float, high: float) -> Triple:
 
 
 def furnished_room(rng: np.random.Generator) -> Room:
-    """Four by three and a half metres: the furniture stands fast, the clutter is drawn."""
+    """4.4 by 3.8 metres: the furniture stands fast, the clutter is drawn."""
     room = Room()
     wall, oak, dark = (0.87, 0.85, 0.80), (0.66, 0.47, 0.28), (0.30, 0.22, 0.17)
     room.box((0.0, 0.0, -0.1), (4.4, 3.8, 0.1), (0.55, 0.45, 0.36))

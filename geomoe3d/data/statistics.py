@@ -21,6 +21,7 @@ from geomoe3d.types import FloatArray
 
 BANDS = (0.1, 0.3, 0.6, 1.01)
 _PLANE_DISTANCE, _PLANE_SHARE, _PLANES = 0.03, 0.1, 5
+_FRAGMENTS, _SEED = 400, 0
 
 
 @dataclass(frozen=True)
@@ -44,29 +45,25 @@ class Statistics:
     residual: FloatArray
 
 
-def measure(
-    folder: str | Path, *, max_fragments: int = 400, max_pairs: int = 3000, seed: int = 0
-) -> Statistics:
-    """Statistics of a folder of described fragments.
+def measure(folder: str | Path, *, max_pairs: int = 3000) -> Statistics:
+    """Statistics of a folder of described fragments, the same at every call.
 
     Args:
         folder: of shards.
-        max_fragments: measured, drawn evenly.
-        max_pairs: measured, drawn evenly.
-        seed: of keypoints and choice.
+        max_pairs: measured, drawn evenly; of fragments 400 are.
 
     Raises:
         InputError: no shards.
         FormatError: a shard is damaged.
     """
-    rng = np.random.default_rng([seed, 11])
+    rng = np.random.default_rng([_SEED, 11])
     places = []
     for path in shard_folders(folder):
         scene = open_shard(path)
         places += [(scene, k) for k in range(len(scene.start) - 1)]
-    kept = np.sort(rng.permutation(len(places))[:max_fragments])
+    kept = np.sort(rng.permutation(len(places))[:_FRAGMENTS])
     rows = [_of_fragment(places[k][0].fragment(places[k][1])[0], rng) for k in kept]
-    pairs = FragmentPool(folder, PROTOCOL, seed)
+    pairs = FragmentPool(folder, PROTOCOL, _SEED)
     numbers = np.sort(rng.permutation(pairs.num_pairs)[:max_pairs])
     ratios, residuals = [], []
     for number in numbers:

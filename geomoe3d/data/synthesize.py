@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.data.fragments import relate
+from geomoe3d.data.fragments import OVERLAP_GRID, relate
 from geomoe3d.data.record import choose_scene, record
 from geomoe3d.data.rooms.models import ModelLibrary, open_library
 from geomoe3d.data.rooms.scenes import load_mesh_scene
 from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 MANIFEST = "manifest.json"
@@ -176,7 +176,7 @@ def make_scene(job: Job, number: int) -> SceneSummary:
         recorded.poses,
         job.settings.min_overlap,
         # What a camera saw at one place is compared as the benchmark does, whatever the points kept.
-        job.settings.grid if job.settings.recorder == "scanner" else 0.025,
+        job.settings.grid if job.settings.recorder == "scanner" else OVERLAP_GRID,
     )
     summary = SceneSummary(
         number,
@@ -285,8 +285,7 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
         elif any(folder.iterdir()):
             raise OutputError(f"'{folder}' holds files but no {MANIFEST}; give a new folder")
         else:
-            text = json.dumps(manifest, indent=1) + "\n"
-            write_atomically(path, lambda temporary: _put(temporary, text), force=False)
+            write_text(path, json.dumps(manifest, indent=1) + "\n", force=False)
         for rest in folder.glob(f"{_WRITING}*"):
             shutil.rmtree(rest, ignore_errors=True)
     except OSError as error:
@@ -300,10 +299,6 @@ def _completed(manifest: Any) -> Any:
     if isinstance(manifest, dict) and isinstance(manifest.get("settings"), dict):
         return {**manifest, "settings": {"recorder": "camera", **manifest["settings"]}}
     return manifest
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text)
 
 
 def _differences(found: Any, wanted: Any, where: str = "") -> list[str]:

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
+from geomoe3d.files import write_text
+from geomoe3d.geometry.se3 import inverse, is_motion, make_transform, project_to_so3
 from geomoe3d.types import FloatArray
 
 BENCHMARKS = ("3DMatch", "3DLoMatch")
@@ -155,34 +156,28 @@ def read_gt_overlap(path: str | Path) -> dict[tuple[int, int], float]:
     return overlaps
 
 
-def write_gt_log(path: str | Path, entries: PairTable, num_fragments: int, *, force: bool = False) -> None:
+def write_gt_log(path: str | Path, entries: PairTable, num_fragments: int) -> None:
     """Write entries (i, j, T), T mapping j into i, with all digits of a double.
 
     Raises:
-        OutputError: the file exists and ``force`` is False, or the disk refuses.
+        OutputError: the file exists, or the disk refuses.
     """
-    from geomoe3d.files import write_atomically
-
     lines = []
     for i, j, T in entries:
         lines.append(f"{i}\t{j}\t{num_fragments}")
         lines += ["\t".join(f"{value:.17g}" for value in row) for row in T]
     text = "".join(line + "\n" for line in lines)
-    write_atomically(path, lambda temporary: _put(temporary, text), force=force)
+    write_text(path, text, force=False)
 
 
-def write_gt_overlap(
-    path: str | Path, overlaps: dict[tuple[int, int], float], *, force: bool = False
-) -> None:
+def write_gt_overlap(path: str | Path, overlaps: dict[tuple[int, int], float]) -> None:
     """Write ``i,j,overlap`` lines, four digits.
 
     Raises:
-        OutputError: the file exists and ``force`` is False, or the disk refuses.
+        OutputError: the file exists, or the disk refuses.
     """
-    from geomoe3d.files import write_atomically
-
     text = "".join(f"{i},{j},{value:.4f}\n" for (i, j), value in sorted(overlaps.items()))
-    write_atomically(path, lambda temporary: _put(temporary, text), force=force)
+    write_text(path, text, force=False)
 
 
 def true_motion(entry: FloatArray, *, raw: bool = False) -> FloatArray:
@@ -240,10 +235,10 @@ def load_benchmark(
     return pairs
 
 
-def load_fixed_correspondences(
+def iterate_fixed_correspondences(
     root: str | Path | None = None, benchmark: str = "3DMatch"
-) -> list[FixedCorrespondences]:
-    """The fixed 1k correspondences of every pair, scenes by name, pairs in gt.log order.
+) -> Iterator[FixedCorrespondences]:
+    """The fixed 1k correspondences of every pair, scenes by name, pairs in gt.log order, one scene in memory.
 
     Args:
         root: as in `load_benchmark`.
@@ -253,13 +248,6 @@ def load_fixed_correspondences(
         InputError: unknown benchmark, or the folder or its files are missing.
         FormatError: a file lacks an array or cannot be decoded.
     """
-    return list(iterate_fixed_correspondences(root, benchmark))
-
-
-def iterate_fixed_correspondences(
-    root: str | Path | None = None, benchmark: str = "3DMatch"
-) -> Iterator[FixedCorrespondences]:
-    """As `load_fixed_correspondences`, one scene in memory at a time."""
     folder = _benchmark_folder(find_benchmark_root(root) / "correspondences-1k", benchmark)
     files = sorted(folder.glob("*.npz"))
     if not files:
@@ -325,17 +313,7 @@ def _read_blocks(path: Path, size: int) -> PairTable:
             )
         if not np.isfinite(matrix).all():
             raise FormatError(f"'{path}' line {number}: the entry {i} {j} is not finite")
-        if size == 4 and not _is_motion(matrix):
+        if size == 4 and not is_motion(matrix, _MAX_SKEW):
             raise FormatError(f"'{path}' line {number}: the entry {i} {j} is no rigid motion")
         entries.append((i, j, matrix))
     return entries
-
-
-def _is_motion(matrix: FloatArray) -> bool:
-    R = matrix[:3, :3]
-    turns = np.abs(R @ R.T - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
-    return bool(turns and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6))
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="ascii")

@@ -13,8 +13,7 @@ from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.surroundings import Surroundings
-from geomoe3d.filters.base import FilterOutput
-from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis
+from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray, Hypothesis
 
 
 def propose(

@@ -15,16 +15,10 @@ from geomoe3d.types import Hypothesis
 
 @dataclass(frozen=True)
 class WeightedSvdEstimator:
-    """Weighted Kabsch over all correspondences, then reweighted re-fits on the inliers.
+    """Weighted Kabsch over all correspondences.
 
     This is the numpy form; `geomoe3d.geometry.kabsch.weighted_kabsch` is the batched differentiable twin.
-
-    Attributes:
-        num_refits: rounds of re-fitting with weights w / (1 + (r / threshold)^2) on residuals under the
-            threshold; 0 gives the plain weighted SVD. Source: PointDSC's post-refinement uses 20.
     """
-
-    num_refits: int = 0
 
     def __call__(
         self,
@@ -40,12 +34,6 @@ class WeightedSvdEstimator:
         if (w > 0).sum() < 3 or min(spread(source, w), spread(target, w)) < 1e-6 * inlier_threshold:
             return []
         R, t = fit_rigid(source, target, w)
-        for _ in range(self.num_refits):
-            r2 = squared_residuals(R[None], t[None], source, target)[0] / inlier_threshold**2
-            inner = w * (r2 < 1) / (1 + r2)
-            if (inner > 0).sum() < 3 or spread(source, inner) < 1e-6 * inlier_threshold:
-                break
-            R, t = fit_rigid(source, target, inner)
         r2 = squared_residuals(R[None], t[None], source, target)[0]
         score = float((w * np.maximum(1 - r2 / inlier_threshold**2, 0)).sum())
         num_inliers = int((r2 < inlier_threshold**2).sum())

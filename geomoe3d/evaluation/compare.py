@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.errors import InputError
-from geomoe3d.evaluation.intervals import RESAMPLES, Interval, Quantity, Statistic, measure_all, quantile
+from geomoe3d.evaluation.intervals import RESAMPLES, Interval, Quantity, Statistic, Z, measure_all, quantile
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
 from geomoe3d.types import BoolArray, FloatArray
 
@@ -166,7 +166,7 @@ def agresti_min(a_only: int, b_only: int, count: int) -> Interval:
     """95 % interval in points of the difference of two paired proportions, with half a pair in each cell."""
     n, plus, minus = count + 2.0, a_only + 0.5, b_only + 0.5
     center = (plus - minus) / n
-    half = 1.959963984540054 * math.sqrt((plus + minus) / n - center**2) / math.sqrt(n)
+    half = Z * math.sqrt((plus + minus) / n - center**2) / math.sqrt(n)
     return 100.0 * max(-1.0, center - half), 100.0 * min(1.0, center + half)
 
 

@@ -25,7 +25,8 @@ from geomoe3d.types import FloatArray, IntArray
 
 RESAMPLES = 2000
 _LEVEL = 0.95
-_Z = 1.959963984540054
+Z = 1.959963984540054
+"""Standard deviations to either side that hold 95 % of a normal distribution."""
 _BLOCK = 4_000_000
 _UNDEFINED = (math.nan, math.nan)
 
@@ -51,20 +52,6 @@ class Quantity:
     unit: str
     statistic: Literal["mean", "scene_mean"] | float | Statistic = "mean"
     reflected: bool = False
-
-
-def measure(
-    values: FloatArray | Sequence[float],
-    scenes: Sequence[str],
-    *,
-    unit: str,
-    statistic: Literal["mean", "scene_mean"] | float | Statistic = "mean",
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> Measure:
-    """One array of values with its scenes as a `Measure`; see `Quantity` and `measure_all`."""
-    quantity = Quantity(np.asarray(values, dtype=np.float64), unit, statistic)
-    return measure_all({"": quantity}, scenes, resamples=resamples, seed=seed)[""]
 
 
 def measure_all(
@@ -135,9 +122,9 @@ def wilson(share: float, count: int) -> Interval:
     """Wilson's 95 % interval in % for a share in [0, 1] of ``count`` independent outcomes; NaN for none."""
     if count == 0:
         return _UNDEFINED
-    z2 = _Z * _Z / count
+    z2 = Z * Z / count
     center = (share + z2 / 2.0) / (1.0 + z2)
-    half = _Z * math.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count)) / (1.0 + z2)
+    half = Z * math.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count)) / (1.0 + z2)
     low = 0.0 if share == 0.0 else max(0.0, center - half)
     high = 1.0 if share == 1.0 else min(1.0, center + half)
     return 100.0 * low, 100.0 * high

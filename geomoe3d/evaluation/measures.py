@@ -13,7 +13,7 @@ import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.records import EvaluationPair, Labels, PairScore, Prediction
-from geomoe3d.geometry.se3 import rotation_error_deg, translation_error
+from geomoe3d.geometry.se3 import is_motion, project_to_so3, rotation_error_deg, translation_error
 from geomoe3d.types import BoolArray, FloatArray
 
 ROTATION_LIMIT_DEG = 15.0
@@ -28,7 +28,6 @@ RMSE_LIMIT = 0.20
 _DIGITS = 9
 _Triple = tuple[float, float, float] | tuple[None, None, None]
 _RIGID_TOLERANCE = 1e-2
-_LAST_ROW_TOLERANCE = 1e-6
 
 
 def score_pair(pair: EvaluationPair, prediction: Prediction, *, raw_truth: bool = False) -> PairScore:
@@ -107,14 +106,7 @@ def score_pair(pair: EvaluationPair, prediction: Prediction, *, raw_truth: bool 
 
 def has_motion(T: FloatArray | None) -> bool:
     """Whether an answer (4, 4) is a rigid motion: finite, last row 0 0 0 1, rotation within 0.01 of SO(3)."""
-    if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
-        return False
-    R = T[:3, :3]
-    return bool(
-        np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() <= _LAST_ROW_TOLERANCE
-        and np.abs(R.T @ R - np.eye(3)).max() <= _RIGID_TOLERANCE
-        and np.linalg.det(R) > 0
-    )
+    return T is not None and is_motion(T, _RIGID_TOLERANCE)
 
 
 def motion_errors(T: FloatArray | None, T_truth: FloatArray, *, raw: bool = False) -> tuple[float, float]:
@@ -173,33 +165,18 @@ def benchmark_rmse(T: FloatArray | None, T_truth: FloatArray, information: Float
     Returns:
         inf where there is no motion; None where the matrix weighs no point (I_11 not above 0 or not finite).
     """
+    from scipy.spatial.transform import Rotation
+
     if not np.isfinite(information).all() or information[0, 0] <= 0:
         return None
     if T is None or not has_motion(T):
         return math.inf
     delta = T_truth @ np.linalg.inv(T)
-    error = np.concatenate([delta[:3, 3], quaternion(delta[:3, :3])[1:]])
+    # The nearest rotation first: what scipy takes of a matrix that is none depends on its version.
+    turn = Rotation.from_matrix(project_to_so3(delta[:3, :3])).as_quat(canonical=True)
+    error = np.concatenate([delta[:3, 3], turn[:3]])
     squared = float(error @ information @ error) / float(information[0, 0])
     return math.sqrt(max(squared, 0.0))
-
-
-def quaternion(R: FloatArray) -> FloatArray:
-    """(4,) unit quaternion w, x, y, z with w >= 0 of the rotation nearest to a matrix (3, 3).
-
-    The leading eigenvector of the symmetric 4x4 matrix of Horn (1987): accurate at every angle, 180 degrees
-    included, where the sign of the axis is arbitrary.
-    """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = (float(value) for value in R.ravel())
-    lower = np.array(
-        [
-            [xx + yy + zz, 0.0, 0.0, 0.0],
-            [zy - yz, xx - yy - zz, 0.0, 0.0],
-            [xz - zx, xy + yx, yy - xx - zz, 0.0],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    q: FloatArray = np.linalg.eigh(lower)[1][:, -1]
-    return -q if q[0] < 0 else q
 
 
 def precision_recall_f1(labels: BoolArray, truth: BoolArray) -> tuple[float, float, float]:

@@ -18,21 +18,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.clouds.viewpoint import believed_viewpoints
 from geomoe3d.config import RegistrationConfig, load_config
+from geomoe3d.correspondence_solver import CorrespondenceSolver
 from geomoe3d.errors import ConfigError, InputError
-from geomoe3d.estimators.base import make_estimator
-from geomoe3d.estimators.proposals import solve
 from geomoe3d.evaluation.adapter import AdaptedFunction
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
 from geomoe3d.evaluation.records import Answer, Method, MethodInput
-from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
+from geomoe3d.filters.base import FilterOutput, resolved
 from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, find_weights
-from geomoe3d.geometry.se3 import shift_frames
-from geomoe3d.stages import StageClock
-from geomoe3d.types import BoolArray, Correspondences, FloatArray
+from geomoe3d.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from geomoe3d.registration import Registrar
@@ -122,15 +117,12 @@ class OurMethod:
         self.config: RegistrationConfig = resolved(load_config(None, [*OURS[name], *assignments]))
         self._own_threshold = "estimator.inlier_threshold" in keys
         self._registrar: Registrar | None = None
-        self._filter: Filter | None = None
+        self._solver: CorrespondenceSolver | None = None
         if self.absent() is None:
-            self._filter = make_filter(
-                self.config.filter.name, self.config.filter.weights, self.config.estimator
-            )
-            network = getattr(self._filter, "config", None)
+            self._solver = CorrespondenceSolver(self.config)
+            network = getattr(self._solver.filter, "config", None)
             if _MATCHING_CHANNELS & set(getattr(network, "extra_channels", ())):
                 self.inputs -= {"correspondences"}  # bare coordinates lack what the network was trained with
-        self._estimator = make_estimator(self.config.estimator)
 
     def identity(self) -> dict[str, Any]:
         """Configuration, hash of the deciding source, versions of libraries, hash of trained weights."""
@@ -165,36 +157,22 @@ class OurMethod:
 
     def _from_correspondences(self, rows: FloatArray, given: MethodInput) -> Answer:
         """Filter and estimator on rows (N, 6), each half recentred."""
-        if self._filter is None:
+        if self._solver is None:
             raise InputError(f"{given.pair}: {self.absent()}")
         if len(rows) < 3:
             return Answer(None)
-        origins = choose_origin(rows[:, :3]), choose_origin(rows[:, 3:])
-        local = np.asarray(rows, dtype=np.float64) - np.concatenate(origins)
-        threshold = given.inlier_threshold
-        if self._own_threshold:
-            threshold = self.config.estimator.inlier_threshold * given.voxel_size
-        clock = StageClock()
-        clock("weigh")
-        matched = Correspondences(local, viewpoints=believed_viewpoints(local, origins))
-        weighed = self._filter(matched, voxel_size=given.voxel_size, seed=given.seed)
-        clock("solve")
-        found = solve(
-            self._estimator,
-            matched,
-            weighed,
-            self.config.estimator,
-            inlier_threshold=threshold,
+        found = self._solver(
+            rows,
+            voxel_size=given.voxel_size,
+            inlier_threshold=None if self._own_threshold else given.inlier_threshold,
             seed=given.seed,
         )
-        stages = _stages(clock.stop())
-        motions = [shift_frames(hypothesis.T_target_source, *origins) for hypothesis in found]
         return Answer(
-            motions[0] if motions else None,
-            hypotheses=tuple(motions[1:]),
-            weights=self._weights(weighed),
-            inliers=_declared(weighed),
-            seconds=stages,
+            found.T_target_source if found.found else None,
+            hypotheses=found.others,
+            weights=self._weights(found.weighed),
+            inliers=_declared(found.weighed),
+            stages=_stages(found.seconds),
         )
 
     def _from_clouds(self, source: FloatArray, target: FloatArray, seed: int) -> Answer:
@@ -212,7 +190,7 @@ class OurMethod:
             correspondences=explained.correspondences.points + shift,
             weights=self._weights(explained.weighed) if shown else None,
             inliers=_declared(explained.weighed) if shown else None,
-            seconds=_stages(result.seconds),
+            stages=_stages(result.seconds),
         )
 
     def _registrar_for(self, seed: int) -> Registrar:

@@ -161,7 +161,7 @@ class Open3DFeatureRansac(Peer):
         stages = {name: value for name, value in clock.stop().items() if name != "total"}
         T = np.array(answer.transformation)
         failed = _is_identity(T) or len(answer.correspondence_set) < 3
-        return Answer(None if failed else T, seconds=stages)
+        return Answer(None if failed else T, stages=stages)
 
 
 @dataclass(kw_only=True)

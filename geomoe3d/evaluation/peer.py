@@ -24,7 +24,6 @@ from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import make_transform, project_to_so3, shift_frames
 from geomoe3d.types import FloatArray
 
-INSTALL = "pip install 'geomoe3d[peers]'"
 CORRESPONDENCES = frozenset({"correspondences"})
 CLOUDS = frozenset({"clouds"})
 LEAST_MATCHED = 10
@@ -64,9 +63,9 @@ class Peer:
 
     def absent(self) -> str | None:
         """Which library is missing or cannot be loaded, how to install it; None where the peer can run."""
-        limits = f" ({self.limits})" if self.limits else ""
+        install = f"pip install {self.distributions[0]}" + (f" ({self.limits})" if self.limits else "")
         if importlib.util.find_spec(self.module) is None:
-            return f"'{self.name}' needs {self.distributions[0]}, which is not installed: {INSTALL}{limits}"
+            return f"'{self.name}' needs {self.distributions[0]}, which is not installed: {install}"
         try:
             importlib.import_module(self.module)
         except (ImportError, OSError, AttributeError, RuntimeError) as error:
@@ -74,7 +73,7 @@ class Peer:
             reason = " ".join(str(error).split())
             return (
                 f"'{self.name}' needs {self.distributions[0]}, which is installed but cannot be loaded "
-                f"({reason}): {INSTALL}{limits}"
+                f"({reason}): {install}"
             )
         return None
 
@@ -102,9 +101,9 @@ class Peer:
             raise InputError(f"{given.pair}: '{self.name}': {type(error).__name__}: {error}") from error
         T = answer.T_target_source
         if T is None or not np.isfinite(T).all():
-            return Answer(None, inliers=answer.inliers, seconds=answer.seconds)
+            return Answer(None, inliers=answer.inliers, stages=answer.stages)
         T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
-        return Answer(shift_frames(T, *origins), inliers=answer.inliers, seconds=answer.seconds)
+        return Answer(shift_frames(T, *origins), inliers=answer.inliers, stages=answer.stages)
 
     def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
         """The peer itself on recentred points (N, 3); thresholds, voxel size and seed are in ``given``."""

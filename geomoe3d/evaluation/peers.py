@@ -92,7 +92,7 @@ class KissMatcher(Peer):
             "match": matcher.get_matching_time(),
             "solve": matcher.get_rejection_time() + matcher.get_solver_time(),
         }
-        return Answer(T, seconds=stages)
+        return Answer(T, stages=stages)
 
 
 @dataclass(kw_only=True)

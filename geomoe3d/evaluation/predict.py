@@ -299,7 +299,7 @@ def predict_one(method: Method, pair: EvaluationPair, given: MethodInput) -> Pre
         labels=labels,
         weights=answer.weights,
         seconds=seconds,
-        stages={name: float(value) for name, value in answer.seconds.items()},
+        stages={name: float(value) for name, value in answer.stages.items()},
         peak_memory=memory.peak,
         error=error,
     )

@@ -84,7 +84,7 @@ class Answer:
         correspondences: (N, 6) what the method weighed; None means those that it was given.
         weights: (N,) in [0, 1], or None.
         inliers: (N,) the method's own classification, or None where it makes none.
-        seconds: time per stage where the method knows it.
+        stages: seconds per stage where the method knows them.
     """
 
     T_target_source: FloatArray | None
@@ -94,7 +94,7 @@ class Answer:
     correspondences: FloatArray | None = None
     weights: FloatArray | None = None
     inliers: BoolArray | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, float] = field(default_factory=dict)
 
 
 class Method(Protocol):
@@ -124,7 +124,7 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class Labels:
-    """N correspondences of a pair, seen four ways.
+    """N correspondences of a pair, each judged in three ways.
 
     Attributes:
         true: (N,) residual under the true motion below the threshold; all False for unrelated scans.

@@ -1,8 +1,9 @@
 """The cache of predictions: one folder per run, guarded by what the run depends on.
 
-``<study>/<label>/run.json`` says what the predictions come from, ``predictions.jsonl`` holds them, one line
-per pair. A run is only ever continued with the very same identity: settings, method, code, input. Weights are
-stored in half precision and label sets as bits: about 3 kB per pair of 1,000 correspondences.
+``<study>/<label>.<track>.<benchmark>/run.json`` says what the predictions come from, ``predictions.jsonl``
+beside it holds them, one line per pair. A run is only ever continued with the very same identity: settings,
+method, code, input. Weights are stored in half precision and label sets as bits: about 3 kB per pair of 1,000
+correspondences.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 from geomoe3d.journal import Journal, read_journal
 from geomoe3d.types import BoolArray, FloatArray
 
@@ -51,8 +52,7 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
                 f"'{folder}' holds predictions, but '{RUN_FILE}', which says what they come from, is gone; "
                 "give another folder or label, or --fresh to predict again"
             )
-        text = json.dumps(asdict(info), indent=2)
-        write_atomically(folder / RUN_FILE, lambda path: _put(path, text), force=False)
+        write_text(folder / RUN_FILE, json.dumps(asdict(info), indent=2) + "\n", force=False)
     journal = Journal(folder / PREDICTIONS_FILE)
     try:
         done = {str(record.get("pair")) for record in read_journal(journal.path)}
@@ -223,7 +223,3 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             rows[prefix + key] = json.dumps(value, sort_keys=True)
     return rows
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text + "\n", encoding="utf-8")

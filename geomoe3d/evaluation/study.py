@@ -11,6 +11,7 @@ from itertools import combinations
 from pathlib import Path
 
 from geomoe3d.errors import InputError
+from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison, compare
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 from geomoe3d.evaluation.report_json import to_json
@@ -19,7 +20,7 @@ from geomoe3d.evaluation.report_words import run_key
 from geomoe3d.evaluation.store import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.evaluation.task import load_run_pairs
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 
 REPORT_SUFFIXES = (".html", ".md", ".json")
 
@@ -74,7 +75,7 @@ def compare_all(runs: list[StudiedRun]) -> list[Comparison]:
     return [
         compare(one.score, other.score)
         for one, other in combinations(runs, 2)
-        if _task_of(one) == _task_of(other) and one.score.info.benchmark != "unrelated"
+        if _task_of(one) == _task_of(other) and one.score.info.benchmark != UNRELATED
     ]
 
 
@@ -102,13 +103,9 @@ def write_report(path: str | Path, runs: list[StudiedRun], *, force: bool = Fals
     if path.suffix not in REPORT_SUFFIXES:
         raise InputError(f"cannot write '{path}': a report is {', '.join(REPORT_SUFFIXES)}")
     text = to_markdown(scores, comparisons) if path.suffix == ".md" else to_json(scores, comparisons)
-    write_atomically(path, lambda temporary: _put(temporary, text), force=force)
+    write_text(path, text.rstrip() + "\n", force=force)
 
 
 def _task_of(run: StudiedRun) -> tuple[str, str, str]:
     info = run.score.info
     return info.track, info.benchmark, str(info.identity.get("pairs"))
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text.rstrip() + "\n", encoding="utf-8")

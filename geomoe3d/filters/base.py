@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -17,27 +16,8 @@ import numpy as np
 from geomoe3d.config import EstimatorConfig, FilterConfig, RegistrationConfig
 from geomoe3d.errors import ConfigError, DependencyError
 from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, packaged_names
-from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
-
-
-@dataclass(frozen=True)
-class FilterOutput:
-    """What a filter says of N correspondences.
-
-    Attributes:
-        weights: (N,) in [0, 1]; 0 takes a correspondence out of the estimate.
-        logits: (N,) raw scores, larger is likelier an inlier, or None.
-        groups: (N,) small integers, which part of the filter handled each correspondence, or None.
-        group_names: a name for each group, for display.
-        hypotheses: motions that the filter judged, best first; the weights hold under the first, and the
-            estimator need not seek them again. Empty for filters that know none.
-    """
-
-    weights: FloatArray
-    logits: FloatArray | None = None
-    groups: IntArray | None = None
-    group_names: tuple[str, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] = ()
+from geomoe3d.types import Correspondences
+from geomoe3d.types import FilterOutput as FilterOutput  # part of the form, offered here too
 
 
 class Filter(Protocol):
@@ -112,8 +92,17 @@ def resolve_filter(config: FilterConfig) -> FilterConfig:
 
 
 def resolved(config: RegistrationConfig | None) -> RegistrationConfig:
-    """The configuration, None for the defaults, with ``auto`` replaced by what it means on this machine."""
-    config = config or RegistrationConfig()
+    """The configuration, None for the defaults, with ``auto`` replaced by what it means on this machine.
+
+    Raises:
+        ConfigError: something else than a configuration.
+    """
+    config = RegistrationConfig() if config is None else config
+    if not isinstance(config, RegistrationConfig):
+        raise ConfigError(
+            f"config is a {type(config).__name__}, expected a RegistrationConfig; load_config(path, "
+            f"['key=value', ...]) makes one"
+        )
     return config.model_copy(update={"filter": resolve_filter(config.filter)})
 
 

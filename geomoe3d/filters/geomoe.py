@@ -50,7 +50,7 @@ class GeoMoEOutput:
     """What the network returns.
 
     Attributes:
-        logits: (L, B, N) of every layer, the last one first to be believed; 0 at padding.
+        logits: (L, B, N) of every layer, in order; those of the last are the answer; 0 at padding.
         balance: scalar load-balance loss, mean over F-MoEs and layers; 0 without experts.
         usage: (L, 2, T) expert usage, or None.
         entropy: (L, 2) router entropy, or None.

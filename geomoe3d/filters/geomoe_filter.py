@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import CheckpointError
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.base import Filter, FilterOutput
+from geomoe3d.filters.base import Filter
 from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, PairInput, pair_input
 from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS
-from geomoe3d.types import Correspondences, FloatArray, IntArray
+from geomoe3d.types import Correspondences, FilterOutput, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -89,16 +89,6 @@ class GeoMoEFilter:
         self.card = card
         self.device = torch.device(device)
         self._network = FoldedGeoMoE(model.to(self.device).eval())
-
-    @classmethod
-    def from_pretrained(cls, name_or_path: str | Path, device: str | torch.device = "cpu") -> GeoMoEFilter:
-        """Load a .safetensors file with its card, or weights that ship with the package.
-
-        Raises:
-            CheckpointError: see `geomoe3d.filters.pretrained.load_pretrained`.
-        """
-        model, card = load_pretrained(name_or_path)
-        return cls(model, card, device)
 
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
         """Weigh correspondences; see `Filter`.

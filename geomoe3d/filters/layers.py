@@ -236,14 +236,15 @@ class MotionVerdict(nn.Module):
     attention.
     """
 
+    _HIDDEN_WIDTH = 64
     _LEAST_MEAN = 0.005  # means are shares of the correspondences; below this they say nothing
 
-    def __init__(self, config: NetworkConfig, hidden_width: int = 64) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.attend = Pointwise(config.width, 1)
         self.norm = BatchNorm(3 * config.input_width + 1 + 2 * config.width)
-        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, hidden_width)
-        self.out = Pointwise(hidden_width, 1)
+        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, self._HIDDEN_WIDTH)
+        self.out = Pointwise(self._HIDDEN_WIDTH, 1)
 
     def forward(self, channels: Tensor, field: Tensor, together: Tensor, mask: Tensor | None) -> Tensor:
         """Verdicts of a batch.

@@ -23,7 +23,6 @@ from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.base import FilterOutput
 from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.geomoe_filter import Insight, finite_part, run_several
@@ -31,7 +30,7 @@ from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, MotionInputs
 from geomoe3d.filters.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained
 from geomoe3d.threads import each, single_blas_thread
-from geomoe3d.types import Correspondences, FloatArray, Hypothesis, IntArray
+from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, IntArray
 
 MOST_MOTIONS = 6
 """Motions that the filter judges of those that consensus proposes."""

@@ -14,7 +14,7 @@ from typing import Any
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, ConfigError
-from geomoe3d.files import check_output, write_atomically
+from geomoe3d.files import check_output, write_atomically, write_text
 from geomoe3d.filters.architecture import NetworkConfig
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.weight_files import find_weights
@@ -87,7 +87,7 @@ def save_pretrained(
     values["architecture"] = model.config.model_dump(mode="json")
     values["sha256"] = hashlib.sha256(data).hexdigest()
     text = json.dumps({"format": _FORMAT, "version": _VERSION, **values}, indent=2) + "\n"
-    write_atomically(card_path(path), lambda temporary: _write(temporary, text.encode()), force=force)
+    write_text(card_path(path), text, force=force)
     return WeightCard(**values)
 
 

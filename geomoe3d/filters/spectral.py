@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomoe3d.filters.base import FilterOutput
-from geomoe3d.types import Correspondences, Float32Array
+from geomoe3d.types import Correspondences, FilterOutput, Float32Array
 
 
 @dataclass(frozen=True)

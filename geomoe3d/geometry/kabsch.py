@@ -83,23 +83,12 @@ def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor | None = Non
     return RigidFit(_assemble(R, t), valid)
 
 
-def rotation_from_covariance(covariance: Tensor) -> Tensor:
-    """Rotation R maximising tr(R H) for H = sum_i w_i (p_i - p_mean)(q_i - q_mean)^T.
-
-    Args:
-        covariance: (..., 3, 3) float H, source rows and target columns.
-
-    Returns:
-        Proper rotations (..., 3, 3) of the same dtype; some rotation where H does not determine one (zero,
-        rank one, reflection tie). Gradients are finite everywhere.
-
-    Source:
-        R = V diag(1, 1, det(V U^T)) U^T with H = U S V^T.
-    """
-    return _rotation(covariance.double())[0].to(covariance.dtype)
-
-
 def _rotation(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """R maximising tr(R H) for H (..., 3, 3) = sum_i w_i (p_i - p_mean)(q_i - q_mean)^T, and its spread.
+
+    Some rotation where H does not determine one (zero, rank one, reflection tie). With H = U S V^T it is
+    V diag(1, 1, det(V U^T)) U^T.
+    """
     result: tuple[Tensor, Tensor] = _ProcrustesRotation.apply(covariance)  # type: ignore[no-untyped-call]
     return result
 

@@ -11,6 +11,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.types import FloatArray
 
 _MOTION_TOLERANCE = 0.01  # published poses are up to 5e-4 off
+_LAST_ROW_TOLERANCE = 1e-6
 
 
 def make_transform(R: NDArray[np.floating[Any]], t: NDArray[np.floating[Any]]) -> FloatArray:
@@ -78,6 +79,25 @@ def shift_frames(T_local: FloatArray, source_origin: FloatArray, target_origin: 
     return T
 
 
+def is_rotation(R: FloatArray, tolerance: float) -> bool:
+    """Whether R (3, 3) does not mirror and R^T R is within ``tolerance`` of the identity, entry by entry."""
+    return _off_rotation(R) <= tolerance and bool(np.linalg.det(R) > 0)
+
+
+def is_motion(T: FloatArray, tolerance: float) -> bool:
+    """Whether T is (4, 4), finite, its last row 0 0 0 1 within 1e-6, and `is_rotation` of its linear part."""
+    return (
+        T.shape == (4, 4)
+        and bool(np.isfinite(T).all())
+        and bool(np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() <= _LAST_ROW_TOLERANCE)
+        and is_rotation(T[:3, :3], tolerance)
+    )
+
+
+def _off_rotation(R: FloatArray) -> float:
+    return float(np.abs(R.T @ R - np.eye(3)).max())
+
+
 def check_motion(T: ArrayLike) -> FloatArray:
     """A user's matrix as a rigid motion (4, 4), its rotation projected onto SO(3).
 
@@ -89,11 +109,13 @@ def check_motion(T: ArrayLike) -> FloatArray:
         matrix = np.array(T, dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError("a motion must be a matrix of numbers of shape (4, 4)") from None
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+    if matrix.shape != (4, 4):
         raise InputError(f"a motion must be 16 finite numbers of shape (4, 4), found shape {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise InputError("a motion must be 16 finite numbers of shape (4, 4), found NaN or infinities in it")
     R = matrix[:3, :3]
-    off = float(np.abs(R.T @ R - np.eye(3)).max())
-    if off > _MOTION_TOLERANCE or np.linalg.det(R) < 0:
+    if not is_rotation(R, _MOTION_TOLERANCE):
+        off = _off_rotation(R)
         what = "mirrors" if off <= _MOTION_TOLERANCE else f"is {off:.3g} off a rotation"
         raise InputError(
             f"the matrix is no rigid motion: its linear part {what} (at most {_MOTION_TOLERANCE}); scale and "

@@ -18,6 +18,7 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import cross_matrix, inverse, make_transform, project_to_so3, transform_points
 from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
 _NUM_POINTS = 500  # of each scan, asked about each neighbour
@@ -49,6 +50,7 @@ class Surface:
         return cls(cloud.points, cloud.normals, cloud.viewpoint is not None)
 
 
+@single_blas_thread()
 def align_scans(
     poses: Mapping[int, FloatArray],
     surfaces: Mapping[int, Surface],

@@ -8,7 +8,6 @@ square distance by which they move the points of the source scan.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from geomoe3d.judge import deviations_at
 from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
 
-Verdict = Literal["kept", "rejected"]
 _MOST_LOG_ODDS = 7.0
 _LEAST_OBSERVABILITY = 1e-3  # directions weaker than this share of the strongest are held this much
 

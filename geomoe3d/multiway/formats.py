@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geomoe3d.geometry.se3 import cross_matrix
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.types import FloatArray
 
@@ -52,10 +53,9 @@ def right_information(edge: Edge) -> FloatArray:
     A small motion x on the right of T equals Ad(T) x on its left.
     """
     R, t = edge.T_target_source[:3, :3], edge.T_target_source[:3, 3]
-    across = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     adjoint = np.zeros((6, 6))  # order [rotation, translation]
     adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[3:, :3] = across @ R
+    adjoint[3:, :3] = cross_matrix(t) @ R
     adjoint[:, :3] *= 2.0  # the vector part of a quaternion is half the turn
     order = [3, 4, 5, 0, 1, 2]
     information = adjoint.T @ edge.information @ adjoint
@@ -65,19 +65,10 @@ def right_information(edge: Edge) -> FloatArray:
 
 def quaternion(R: FloatArray) -> FloatArray:
     """Unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3)."""
-    a, b, c, d, e, f, g, h, i = R.ravel()
-    squares = np.array([1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i])
-    rows = np.array(
-        [
-            [squares[0], b + d, c + g, h - f],
-            [b + d, squares[1], f + h, c - g],
-            [c + g, f + h, squares[2], d - b],
-            [h - f, c - g, d - b, squares[3]],
-        ]
-    )
-    q: FloatArray = rows[int(squares.argmax())]  # the best conditioned of the four formulas
-    q = q / np.linalg.norm(q)
-    return -q if q[3] < 0 else q
+    from scipy.spatial.transform import Rotation
+
+    q: FloatArray = Rotation.from_matrix(R).as_quat(canonical=True)
+    return q
 
 
 def _seven(T: FloatArray) -> str:

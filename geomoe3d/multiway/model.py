@@ -13,18 +13,22 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.answer import library_versions
-from geomoe3d.clouds.io import load_points, save_points
+from geomoe3d.batch.folder import foreign, has_mark, remove
+from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points, save_points
 from geomoe3d.clouds.prepare import voxel_means
-from geomoe3d.errors import InputError
-from geomoe3d.files import write_atomically
+from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import inverse, shift_frames, transform_points
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.formats import g2o_text, kitti_text, tum_text
 from geomoe3d.multiway.scans import Scan
 from geomoe3d.types import FloatArray
 
-POSES_FILE = "poses.json"
+POSES_FILE, PAGE_FILE = "poses.json", "page.html"
+PAGE_MARK = '<meta name="generator" content="geomoe3d multiway">'
+_FORMAT, _KIND = "geomoe3d scene 1", "geomoe3d scene "
 _GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|g2o|ply)")
+_OFTEN_NO_CLOUDS = {".txt", ".csv", ".npy", ".npz"}
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ class SceneModel:
         """Everything but the points, in JSON; matrices by rows, every digit."""
         paths = {scan.name: scan.path for scan in self.scans}
         data: dict[str, Any] = {
-            "format": "geomoe3d scene 1",
+            "format": _FORMAT,
             "versions": library_versions(),
             "voxel_size": self.voxel_size,
             "groups": [
@@ -130,23 +134,78 @@ class SceneModel:
         return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def check_folder(folder: Path, inputs: Iterable[str | os.PathLike[str]]) -> None:
+def check_folder(folder: Path, inputs: Iterable[str | os.PathLike[str]], *, page: bool) -> None:
     """Refuse a folder in which the model would overwrite, or next time be taken for, something of the user's.
 
+    Args:
+        folder: in which the model is to be written.
+        inputs: files and folders of scans.
+        page: whether a page is written too.
+
     Raises:
-        InputError: it is a file, one of the inputs, or holds files under the model's names but no model.
+        InputError: it is a file, a folder of scans, or holds files of the user's under the model's names.
     """
     if folder.is_file():
         raise InputError(f"'{folder}' is a file; the folder in which the model is written is named last")
-    if any(Path(given).is_dir() and folder.resolve() == Path(given).resolve() for given in inputs):
-        raise InputError(
-            f"'{folder}' is a folder of scans too: the merged cloud would be taken for a scan; give another"
-        )
-    strange = [] if (folder / POSES_FILE).exists() else _group_files(folder)
-    if strange:
-        raise InputError(
-            f"'{strange[0]}' is not of a model of geomoe3d and would be overwritten; give another folder"
-        )
+    if not folder.is_dir():
+        return
+    here = folder.resolve()
+    for given in map(Path, inputs):
+        if here in ([given.resolve()] if given.is_dir() else given.resolve().parents[:1]):
+            raise _among_scans(folder, given)
+    groups = _group_files(folder)
+    if not is_model(folder):
+        for path in (folder / POSES_FILE, *groups):
+            if path.exists():
+                raise InputError(foreign(path, "a model"))
+    path = folder / PAGE_FILE
+    if page and path.exists() and not has_mark(path, PAGE_MARK):
+        raise InputError(f"{foreign(path, 'a model')}, or leave the page out")
+    for path in sorted(folder.iterdir()):
+        if path not in groups and _is_cloud(path):
+            raise _among_scans(folder, path)
+
+
+def is_model(folder: Path) -> bool:
+    """Whether the poses in a folder are those of a model of this package."""
+    try:
+        stored = json.loads((folder / POSES_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(stored, dict) and str(stored.get("format")).startswith(_KIND)
+
+
+def remove_model(folder: Path) -> None:
+    """Delete what an earlier call wrote of a model, apart from its pairs; nothing else is touched.
+
+    Raises:
+        OutputError: a file cannot be removed.
+    """
+    if has_mark(folder / PAGE_FILE, PAGE_MARK):
+        remove([folder / PAGE_FILE])
+    if is_model(folder):  # its poses go last: they say whose the others are
+        remove([*_group_files(folder), folder / POSES_FILE])
+
+
+def _among_scans(folder: Path, scan: Path) -> InputError:
+    return InputError(
+        f"'{folder}' is a folder of scans too ('{scan}'): the merged cloud would be taken for a scan; give "
+        "another"
+    )
+
+
+def _is_cloud(path: Path) -> bool:
+    """By the suffix; text and arrays, which are often something else, only if they can be read as a cloud."""
+    suffix = path.suffix.lower()
+    if suffix not in READABLE_SUFFIXES or not path.is_file():
+        return False
+    if suffix not in _OFTEN_NO_CLOUDS:
+        return True
+    try:
+        load_points(path)
+    except GeoMoE3DError:
+        return False
+    return True
 
 
 def _group_files(folder: Path) -> list[Path]:
@@ -175,15 +234,16 @@ def write_model(model: SceneModel, merged_voxel_size: float | None) -> None:
     """
     number = {scan.name: k for k, scan in enumerate(model.scans)}
     paths = {scan.name: scan.path for scan in model.scans}
-    write_text(model.folder / POSES_FILE, model.to_json())
-    for old in _group_files(model.folder):
-        old.unlink()
+    write_text(model.folder / POSES_FILE, model.to_json(), force=True)
+    remove(_group_files(model.folder))
     for count, group in enumerate(model.groups, start=1):
         names, poses = list(group.poses), list(group.poses.values())
         prefix = model.folder / f"group{count}"
-        write_text(prefix.with_suffix(".tum.txt"), tum_text(names, [number[n] for n in names], poses))
-        write_text(prefix.with_suffix(".kitti.txt"), kitti_text(poses))
-        write_text(prefix.with_suffix(".g2o"), g2o_text(group.local_poses, group.edges))
+        write_text(
+            prefix.with_suffix(".tum.txt"), tum_text(names, [number[n] for n in names], poses), force=True
+        )
+        write_text(prefix.with_suffix(".kitti.txt"), kitti_text(poses), force=True)
+        write_text(prefix.with_suffix(".g2o"), g2o_text(group.local_poses, group.edges), force=True)
         merged = merge_clouds([paths[n] for n in names], poses, merged_voxel_size or model.voxel_size)
         save_points(prefix.with_suffix(".ply"), merged, force=True)
 
@@ -201,12 +261,3 @@ def merge_clouds(paths: Sequence[str], poses: Sequence[FloatArray], voxel_size: 
         parts.append(voxel_means(transform_points(local, cloud.points), voxel_size))
     merged: FloatArray = voxel_means(np.concatenate(parts), voxel_size) + origin
     return merged
-
-
-def write_text(path: Path, text: str) -> None:
-    """A text file, complete or not at all; an older one is replaced."""
-    write_atomically(path, lambda temporary: _put(temporary, text), force=True)
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")

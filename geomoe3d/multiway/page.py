@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import shift_frames, transform_points
-from geomoe3d.multiway.model import SceneGroup, SceneModel, write_text
+from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.scene import thin
 from geomoe3d.visual.upright import upright_axes
@@ -35,7 +36,7 @@ def save_model_page(model: SceneModel, path: Path) -> None:
     Raises:
         OutputError: the page cannot be written.
     """
-    write_text(path, render_model_page(model))
+    write_text(path, render_model_page(model), force=True)
 
 
 def render_model_page(model: SceneModel) -> str:
@@ -61,6 +62,7 @@ def render_model_page(model: SceneModel) -> str:
     }
     placed = sum(len(group.poses) for group in model.groups)
     values = {
+        "mark": PAGE_MARK,
         "title": f"{placed} of {len(model.scans)} scans placed",
         "summary": _summary(model, placed),
         "scans": _scan_list(model, colors),

@@ -9,10 +9,11 @@ Source: Jegou et al., CVPR 2010, with intra-normalisation and signed square root
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from geomoe3d.threads import single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, IntArray
 
 _WORDS = 64
@@ -20,20 +21,20 @@ _SAMPLE = 500  # features of each scan from which the words are found
 _ROUNDS = 12
 
 
-def propose_pairs(features: Sequence[Float32Array], neighbors: int, *, seed: int = 0) -> set[tuple[int, int]]:
-    """Pairs (target, source), target < source, of scans that are among each other's most similar.
+def most_similar(similarity: FloatArray, scan: int, others: Iterable[int], count: int) -> list[int]:
+    """Those of some scans that look most like one, the most similar first; of equals the first.
 
     Args:
-        features: (n_k, 33) FPFH of every scan.
-        neighbors: pairs proposed per scan; a pair counts if either of its scans proposes it.
-        seed: decides the words.
+        similarity: (K, K) of all scans.
+        scan: number of the one.
+        others: numbers of those to choose from; the scan itself is never chosen.
+        count: how many to choose at most.
     """
-    similarity = scan_similarity(features, seed=seed)
-    np.fill_diagonal(similarity, -np.inf)
-    order = np.argsort(-similarity, axis=1, kind="stable")[:, : max(0, min(neighbors, len(features) - 1))]
-    return {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row}
+    ranked = sorted((k for k in others if k != scan), key=lambda k: (-similarity[scan, k], k))
+    return ranked[:count]
 
 
+@single_blas_thread()
 def scan_similarity(features: Sequence[Float32Array], *, seed: int = 0) -> FloatArray:
     """(K, K) cosine of the scans' descriptors."""
     rng = np.random.default_rng(seed)

@@ -89,5 +89,6 @@ def _why_unplaced(survey: Survey, scan: int) -> str:
     surest = f"its surest of {tried} pairs, with '{other}', has confidence {edge.confidence:.3f}"
     voices = sum(edge.worth > survey.rules.least_worth for edge, _ in mine)
     if voices > 1:
-        return f"{surest}, but its {voices} pairs above 0.5 do not agree on one place clearly enough"
+        least = 1 / (1 + np.exp(-survey.rules.least_worth))
+        return f"{surest}, but its {voices} pairs above {least:.2g} do not agree on one place clearly enough"
     return f"{surest}, and nothing agrees with it: one pair must be surer, or two must agree"

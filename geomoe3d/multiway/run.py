@@ -7,31 +7,32 @@ far say to overlap. Pairs are kept in OUT/pairs as a batch: an interrupted or ex
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.batch.run import Labour
-from geomoe3d.batch.store import RUN_FILE, BatchStore, remove_batch
+from geomoe3d.batch.folder import read_identity
+from geomoe3d.batch.memory import worker_bytes_of_any
+from geomoe3d.batch.run import Labour, try_out
+from geomoe3d.batch.store import BatchStore
+from geomoe3d.batch.task import Settings
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
 from geomoe3d.filters.base import resolved
-from geomoe3d.multiway.model import SceneModel, check_folder, write_model
+from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
+from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
+from geomoe3d.multiway.defaults import NEIGHBORS as NEIGHBORS
+from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.report import describe_model
-from geomoe3d.multiway.scans import Scan, choose_common_voxel_size, find_scans
+from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
 from geomoe3d.multiway.survey import Survey
 from geomoe3d.stages import StageClock
 
-ALL_PAIRS_UP_TO = 30
-NEIGHBORS = 10
-MOST_ROUNDS = 3
-
 
 def register_scans(
-    scans: Iterable[str | os.PathLike[str]],
+    scans: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
     config: RegistrationConfig | None = None,
@@ -52,7 +53,8 @@ def register_scans(
     Called again with more scans and the same folder, all pairs of earlier calls are reused.
 
     Args:
-        scans: files, or folders that stand for the clouds in them; at least two.
+        scans: files, or folders that stand for the clouds in them, at least two scans; a single folder need
+            not stand in a list.
         out: folder; made if missing. Gets ``poses.json``, per group ``groupN.tum.txt``, ``.kitti.txt``,
             ``.g2o`` and ``.ply``, ``page.html``, and the pairs as a batch in ``pairs``.
         config: of the pairs; a voxel size in it is that of all scans, None chooses one for all.
@@ -63,32 +65,41 @@ def register_scans(
         merged_voxel_size: of the merged clouds, cloud units; None takes that of the registration.
         page: write a page to turn the model in.
         workers, scheduler, cache: as in `geomoe3d.register_pairs`.
-        fresh: forget what the folder holds of an earlier model.
+        fresh: forget what the folder holds of an earlier model; not before all that can be refused is known.
         progress: called with (pairs done, pairs in all so far proposed).
         say: called with sentences on what begins.
 
     Raises:
-        InputError: fewer than two usable scans, an unknown choice of pairs, or a folder that holds pairs of
-            another configuration, scans of this call, or files of the user's under the names of the model.
-        OutputError: the folder cannot be written, or another process is writing it.
+        InputError: fewer than two usable scans, an unknown choice of pairs, more workers than fit, or a
+            folder that holds pairs of another configuration, scans, or files of the user's under the names
+            of the model's own.
+        DependencyError: Dask is not installed, or a worker has other versions.
+        OutputError: the folder cannot be written, or another process is writing it; or the cache is a file.
     """
     if pairs not in ("auto", "all", "similar"):
         raise InputError(f"pairs is '{pairs}'; choose auto, all or similar")
     if neighbors < 1:
         raise InputError(f"neighbors is {neighbors}, at least 1 pair per scan must be proposed")
-    scans = list(scans)
-    check_folder(Path(out), scans)
+    if merged_voxel_size is not None and not merged_voxel_size > 0:
+        raise InputError(f"merged_voxel_size is {merged_voxel_size}, it must be positive")
+    paths, folder = as_paths(scans), Path(out)
+    labour = Labour(workers, scheduler, cache)
+    labour.check()
+    check_folder(folder, paths, page=page)
     say = say or (lambda text: None)
     clock = StageClock(say)
-    found = find_scans(scans)
-    folder = Path(out)
-    if fresh:
-        remove_batch(folder / "pairs")
+    found = find_scans(paths)
+    stored = None if fresh else _stored_voxel_size(folder / "pairs")
     clock("look at the scans")
-    config, unusable = _with_voxel_size(resolved(config), folder / "pairs", found)
-    store = BatchStore(folder / "pairs", config)
-    survey = Survey(found, config, store, Labour(workers, scheduler, cache), progress, say)
+    config, unusable = _with_voxel_size(resolved(config), stored, found)
+    store = BatchStore(folder / "pairs", config, fresh=fresh)
+    if store.begins:
+        _try_out(labour, found, Settings.of(config, cache) if fresh else None)
+    survey = Survey(found, config, store, labour, progress, say)
     survey.describe(unusable)
+    store.begin()
+    if fresh:
+        remove_model(folder)
     clock("register pairs")
     survey.register(
         survey.first_pairs(pairs == "all" or (pairs == "auto" and len(found) <= ALL_PAIRS_UP_TO), neighbors)
@@ -109,27 +120,36 @@ def register_scans(
     if page:
         from geomoe3d.multiway.page import save_model_page
 
-        save_model_page(model, folder / "page.html")
+        save_model_page(model, folder / PAGE_FILE)
     return replace(model, seconds=clock.stop())
 
 
+def _try_out(labour: Labour, scans: list[Scan], settings: Settings | None) -> None:
+    """Refuse now what the pairs would be refused for later, when much is done or, with settings, removed."""
+    pool = labour.pool(worker_bytes_of_any(scan.path for scan in scans), lambda text: None)
+    try:
+        if settings is not None:  # a worker takes seconds to begin
+            try_out(pool, settings)
+    finally:
+        pool.close()
+
+
 def _with_voxel_size(
-    config: RegistrationConfig, folder: Path, scans: list[Scan]
+    config: RegistrationConfig, stored: float | None, scans: list[Scan]
 ) -> tuple[RegistrationConfig, dict[str, str]]:
-    """The configuration with the voxel size of all scans: given, as in the folder, or chosen now."""
+    """The configuration with the voxel size of all scans: given, as stored with the pairs, or chosen now."""
     if config.voxel_size is not None:
         return config, {}
     unusable: dict[str, str] = {}
-    size = _stored_voxel_size(folder / RUN_FILE)
+    size = stored
     if size is None:
         size, unusable = choose_common_voxel_size(scans, config.preparation)
     tree: dict[str, Any] = {**config.model_dump(), "voxel_size": size}
     return build_config(RegistrationConfig, tree), unusable
 
 
-def _stored_voxel_size(path: Path) -> float | None:
-    try:
-        size = json.loads(path.read_text(encoding="utf-8"))["identity"]["config"]["voxel_size"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def _stored_voxel_size(folder: Path) -> float | None:
+    """That of the batch in a folder, if one was begun."""
+    config = (read_identity(folder) or {}).get("config")
+    size = config.get("voxel_size") if isinstance(config, dict) else None
     return float(size) if isinstance(size, (int, float)) else None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.batch.table import kind_of
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size
 from geomoe3d.config import PreparationConfig
@@ -27,6 +28,28 @@ class Scan:
 
     name: str
     path: str
+
+
+def as_paths(
+    scans: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+) -> list[str | os.PathLike[str]]:
+    """What a caller gave as paths; a single one need not stand in a list.
+
+    Raises:
+        InputError: something else than paths: a model reads its scans from files, again and again.
+    """
+    if isinstance(scans, (str, os.PathLike)):
+        return [scans]
+    if isinstance(scans, (bytes, Mapping)) or not isinstance(scans, Iterable):
+        raise InputError(f"scans must be paths of files or of folders, found {kind_of(scans)}")
+    paths = list(scans)
+    for number, path in enumerate(paths, start=1):
+        if not isinstance(path, (str, os.PathLike)):
+            raise InputError(
+                f"scan {number} must be the path of a file or of a folder, found {kind_of(path)}; save "
+                "clouds in memory first: geomoe3d.save_points"
+            )
+    return paths
 
 
 def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
@@ -59,7 +82,7 @@ def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
 
 
 def choose_common_voxel_size(
-    scans: Iterable[Scan], config: PreparationConfig, progress: Callable[[int, int], None] | None = None
+    scans: Iterable[Scan], config: PreparationConfig
 ) -> tuple[float, dict[str, str]]:
     """One voxel size for all scans, and the scans that cannot be used, with the reason.
 
@@ -71,15 +94,13 @@ def choose_common_voxel_size(
     """
     sizes: dict[str, float] = {}
     unusable: dict[str, str] = {}
-    for number, scan in enumerate(scans := list(scans)):
+    for scan in scans:
         try:
             cloud = load_points(scan.path)
             check_cloud(cloud)
             sizes[scan.path] = choose_voxel_size(cloud, cloud, config.voxel_points)
         except GeoMoE3DError as error:
             unusable[scan.name] = str(error)
-        if progress is not None:
-            progress(number + 1, len(scans))
     if len(sizes) < 2:
         listed = "; ".join(f"{name}: {reason}" for name, reason in unusable.items())
         raise InputError(f"fewer than 2 scans can be used: {listed}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
+from geomoe3d.batch.folder import JOURNAL_FILE
 from geomoe3d.batch.run import Labour, work
-from geomoe3d.batch.store import JOURNAL_FILE, BatchStore, Outcome
+from geomoe3d.batch.store import BatchStore, Outcome
 from geomoe3d.batch.table import PairRow
 from geomoe3d.batch.task import open_cache
 from geomoe3d.clouds.io import load_points
@@ -20,7 +21,7 @@ from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
 from geomoe3d.multiway.grouping import Group, GroupingRules, group_scans, settle
 from geomoe3d.multiway.overlaps import Overlaps
-from geomoe3d.multiway.proposals import scan_similarity
+from geomoe3d.multiway.proposals import most_similar, scan_similarity
 from geomoe3d.multiway.scans import Scan, natural_key
 from geomoe3d.registration import Registrar
 from geomoe3d.stages import StageClock
@@ -35,10 +36,37 @@ _CLOSING_OVERLAP = 0.3
 _CLOSING_PER_SCAN = 1
 
 PairKey = tuple[int, int]
+"""A pair of scans by their numbers, the smaller first; which of them is the source is told by the edge."""
 
 
 class Survey:
-    """The scans of one call with what is known of them so far."""
+    """The scans of one call with what is known of them so far.
+
+    A scan is known by its number, its place among those given. Local coordinates are a scan's file
+    coordinates minus its float64 origin; lengths are in cloud units.
+
+    Args:
+        scans: all of them, usable or not.
+        config: of the pairs, with the voxel size of all scans.
+        store: where the pairs are kept.
+        labour: who registers them; its cache holds the described scans too.
+        progress: called with (pairs done, pairs in all so far proposed), or None.
+        say: called with sentences on what begins.
+
+    Attributes:
+        scans, config, store, labour, progress, say: as given.
+        voxel_size: edge of the common grid.
+        rules: when groups are joined and edges kept.
+        unusable: why a scan cannot be registered, by number.
+        shapes: of every scan, where its points lie in local coordinates; of an unusable one all zeros.
+        surfaces: voxel points and normals (N, 3) in local coordinates, by number, of the usable scans.
+        overlaps: predicts how much two usable scans overlap.
+        similarity: (K, K) cosine of the descriptions of the scans as wholes; -inf where one is unusable, and
+            between a scan and itself.
+        outcomes: what became of every pair asked for so far, with motions in file coordinates.
+        edges: those of them that gave a motion, with motions (4, 4) in local coordinates.
+        aligned: poses T_group_scan (4, 4) in local coordinates after `align`, by the poses before it.
+    """
 
     def __init__(
         self,
@@ -66,7 +94,15 @@ class Survey:
     # ---- the scans by themselves
 
     def describe(self, unusable: dict[str, str]) -> None:
-        """Every scan on the common grid: where its points lie, and how similar it is to the others."""
+        """Every scan on the common grid: where its points lie, and how similar it is to the others.
+
+        Args:
+            unusable: scans that are known to be so, by name, and why.
+
+        Raises:
+            InputError: fewer than two scans can be used.
+            ConfigError, CheckpointError, DependencyError: as `Registrar`.
+        """
         registrar = Registrar(self.config, cache=open_cache(self.labour.cache))
         features: dict[int, Float32Array] = {}
         nowhere = Shape(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3))
@@ -102,7 +138,12 @@ class Survey:
     # ---- which pairs
 
     def first_pairs(self, everything: bool, neighbors: int) -> list[PairKey]:
-        """Pairs to begin with: those known already, and all, or the most similar ones of every scan."""
+        """Pairs to begin with: those known already, and all, or the most similar ones of every scan.
+
+        Args:
+            everything: all pairs of usable scans.
+            neighbors: otherwise so many per scan, but none between scans that have pairs already.
+        """
         usable = self.usable()
         known = self._known()
         if everything:
@@ -110,13 +151,19 @@ class Survey:
         settled = {scan for pair in known for scan in pair}
         wanted = set(known)
         for scan in usable:
-            for other in self._most_similar(scan, usable, neighbors):
+            for other in most_similar(self.similarity, scan, usable, neighbors):
                 if scan not in settled or other not in settled:
                     wanted.add(_key(scan, other))
         return sorted(wanted)
 
     def further_pairs(self, groups: list[Group], neighbors: int, *, closing: bool) -> list[PairKey]:
-        """Pairs not tried yet that could tie loose scans and groups, or, if wanted, close loops."""
+        """Pairs not tried yet that could tie loose scans and groups, or, if wanted, close loops.
+
+        Args:
+            groups: as they stand, the largest first.
+            neighbors: how many are proposed per scan that is not in the largest group.
+            closing: also pairs within a group whose poses say that they overlap.
+        """
         more: set[PairKey] = set()
         largest = set(groups[0].poses)
         for group in groups:
@@ -125,7 +172,8 @@ class Survey:
             outside = [k for k in self.usable() if k not in group.poses]
             for scan in group.poses:
                 untried = [k for k in outside if _key(scan, k) not in self.outcomes]
-                more |= {_key(scan, other) for other in self._most_similar(scan, untried, neighbors)}
+                found = most_similar(self.similarity, scan, untried, neighbors)
+                more |= {_key(scan, other) for other in found}
         for group in groups if closing else []:
             more |= self._closing_pairs(group)
         return sorted(more)
@@ -143,10 +191,6 @@ class Survey:
                         found.append((-overlap, i))
             chosen |= {(i, j) for _, i in sorted(found)[:_CLOSING_PER_SCAN]}
         return chosen
-
-    def _most_similar(self, scan: int, others: Iterable[int], count: int) -> list[int]:
-        ranked = sorted((k for k in others if k != scan), key=lambda k: (-self.similarity[scan, k], k))
-        return ranked[:count]
 
     def _known(self) -> set[PairKey]:
         """Pairs in the journal whose scans and files are the same today."""
@@ -209,11 +253,20 @@ class Survey:
         return sorted(groups or [], key=lambda group: (-len(group.poses), min(group.poses)))
 
     def settle(self, group: Group, edges: list[Edge]) -> list[Group]:
-        """The group, or what is left of it, aligned and held by edges that agree closely."""
+        """The group, or what is left of it, aligned and held by edges that agree closely.
+
+        Args:
+            group: from `group_scans`.
+            edges: of all registered pairs.
+        """
         return settle(group, edges, self.shapes, self.rules, self.align)
 
     def align(self, poses: dict[int, FloatArray]) -> dict[int, FloatArray]:
-        """The poses of a group laid on each other by the scans' surfaces; once, however often asked."""
+        """The poses of a group laid on each other by the scans' surfaces; once, however often asked.
+
+        Args:
+            poses: T_group_scan (4, 4) in local coordinates, by number; so is what is returned.
+        """
         key = tuple((scan, poses[scan].tobytes()) for scan in sorted(poses))
         if key not in self.aligned:
             self.aligned[key] = align_scans(

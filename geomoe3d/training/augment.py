@@ -13,6 +13,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.config import Section
+from geomoe3d.geometry.se3 import inverse, make_transform
 from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import FloatArray
 
@@ -46,15 +47,14 @@ def augment(
     T = pair.T_target_source
     if rng.random() < config.swap:
         halves.reverse()
-        R = T[:3, :3].T
-        T = _motion(R, -R @ T[:3, 3])
+        T = inverse(T)
     if config.rotate:
         # About each cloud's middle: origins far away would cost digits.
         middles = [half.mean(axis=0) for half in halves]
         A, B = (Rotation.from_quat(rng.normal(size=4)).as_matrix() for _ in range(2))
         halves = [(halves[0] - middles[0]) @ A.T, (halves[1] - middles[1]) @ B.T]
         R = B @ T[:3, :3] @ A.T
-        T = _motion(R, B @ (T[:3, :3] @ middles[0] + T[:3, 3] - middles[1]))
+        T = make_transform(R, B @ (T[:3, :3] @ middles[0] + T[:3, 3] - middles[1]))
     if config.bend:
         halves = [_bent(half, config.bend, pair.voxel_size, rng) for half in halves]
     points = np.concatenate(halves, axis=1)
@@ -74,9 +74,3 @@ def _bent(points: FloatArray, most: float, voxel_size: float, rng: np.random.Gen
         phase = points @ along * (2 * np.pi / length) + rng.uniform(0, 2 * np.pi)
         moved += amplitude * np.sin(phase)[:, None] * shift
     return moved
-
-
-def _motion(R: FloatArray, t: FloatArray) -> FloatArray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T

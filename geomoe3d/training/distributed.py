@@ -9,6 +9,8 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 
+from geomoe3d.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Process:
@@ -47,10 +49,24 @@ def leave() -> None:
 
 
 def choose_device(name: str, process: Process) -> torch.device:
-    """``auto``: this process's GPU if there is one, else the CPU."""
+    """``auto``: this process's GPU if there is one, else the CPU; ``cuda`` alone: this process's GPU.
+
+    Raises:
+        ConfigError: no device of this name, or none on this machine.
+    """
+    there = torch.cuda.is_available()
     if name == "auto":
-        name = f"cuda:{process.local_rank}" if torch.cuda.is_available() else "cpu"
-    device = torch.device(name)
+        name = "cuda" if there else "cpu"
+    if name == "cuda":
+        name = f"cuda:{process.local_rank}"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ConfigError(f"device is '{name}'; choose auto, cpu, cuda or cuda:0") from None
+    if device.type not in ("cpu", "cuda"):
+        raise ConfigError(f"device is '{name}'; training runs on cpu or cuda")
     if device.type == "cuda":
+        if not there:
+            raise ConfigError(f"device is '{name}', but PyTorch finds no GPU here; choose cpu or auto")
         torch.cuda.set_device(device)
     return device

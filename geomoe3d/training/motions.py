@@ -22,7 +22,7 @@ from geomoe3d.errors import InputError, OutputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 from geomoe3d.training.fragment_pairs import as_training_pair
 from geomoe3d.training.pairs import TrainingPair, write_shard
 from geomoe3d.types import BoolArray, Correspondences
@@ -104,8 +104,7 @@ def propose_motions(
 def _check_identity(path: Path, wanted: dict[str, Any]) -> None:
     """Refuse to mix motions of two origins in one folder; the first run says which it is."""
     if not path.exists():
-        text = json.dumps(wanted) + "\n"
-        write_atomically(path, lambda temporary: _put(temporary, text), force=False)
+        write_text(path, json.dumps(wanted) + "\n", force=False)
         return
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -116,10 +115,6 @@ def _check_identity(path: Path, wanted: dict[str, Any]) -> None:
         raise OutputError(
             f"'{path.parent}' holds motions of another {' and '.join(differs)}; give another folder"
         )
-
-
-def _put(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 @dataclass(frozen=True)

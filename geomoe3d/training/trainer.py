@@ -20,7 +20,7 @@ import torch
 from torch.nn.parallel import DistributedDataParallel
 
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
-from geomoe3d.files import write_atomically
+from geomoe3d.files import write_text
 from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.filters.pretrained import WeightCard, load_pretrained, save_pretrained
 from geomoe3d.provenance import source_commit
@@ -90,8 +90,7 @@ class TrainingRun:
         if self.last_path.exists():
             self._resume()
         elif self.process.is_first:
-            text = _yaml(config)
-            write_atomically(self.folder / "config.yaml", lambda p: _write_text(p, text), force=True)
+            write_text(self.folder / "config.yaml", _yaml(config), force=True)
         self.process.wait()
 
     @property
@@ -281,7 +280,3 @@ def _yaml(config: TrainConfig) -> str:
     import yaml
 
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

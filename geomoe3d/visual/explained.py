@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geomoe3d.visual.view import RegistrationView
+from geomoe3d.visual.view import WEIGHT_THRESHOLD, RegistrationView
 
 if TYPE_CHECKING:
     from geomoe3d.registration import Explanation
@@ -19,15 +19,19 @@ def explained_view(explanation: Explanation) -> RegistrationView:
         explanation: what `geomoe3d.registration.Registrar.explain` returned.
     """
     source, target, matched = explanation.source, explanation.target, explanation.correspondences
+    weighed = explanation.weighed
     filtered = explanation.result.config["filter"]["name"] != "none"  # which weighs everything alike
+    groups = weighed.groups
+    if groups is not None and len(np.unique(groups[weighed.weights > WEIGHT_THRESHOLD])) < 2:
+        groups = None  # one colour for all would hide what agrees
     return RegistrationView(
         source.file_points,
         target.file_points,
         explanation.result,
         np.column_stack([matched.source + source.origin, matched.target + target.origin]),
-        weights=explanation.weighed.weights if filtered else None,
+        weights=weighed.weights if filtered else None,
         source_colors=source.colors,
         target_colors=target.colors,
-        groups=explanation.weighed.groups,
-        group_names=explanation.weighed.group_names,
+        groups=groups,
+        group_names=weighed.group_names,
     )

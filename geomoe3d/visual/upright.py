@@ -18,6 +18,7 @@ _CONVENTIONS: dict[str, tuple[FloatArray, float]] = {
     "y up": (np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), 12.0),
     "camera, y down": (np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), 40.0),
 }
+_NORMALS = 2000
 
 
 def upright_axes(points: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, str]:
@@ -72,12 +73,12 @@ def _convention(points: FloatArray) -> str:
     return "y up" if extent[2] > 1.5 * extent[1] and extent[0] > 1.2 * extent[1] else "z up"
 
 
-def _normals(points: FloatArray, rng: np.random.Generator, num: int = 2000) -> FloatArray:
+def _normals(points: FloatArray, rng: np.random.Generator) -> FloatArray:
     """(n, 3) unit normals, sign arbitrary, of the flat ones among some randomly chosen points."""
     from scipy.spatial import cKDTree
 
     centred = points - points.mean(axis=0)
-    chosen = rng.choice(len(points), size=min(num, len(points)), replace=False)
+    chosen = rng.choice(len(points), size=min(_NORMALS, len(points)), replace=False)
     _, neighbours = cKDTree(centred).query(centred[chosen], k=16)
     patches = centred[neighbours]
     patches = patches - patches.mean(axis=1, keepdims=True)

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.errors import InputError
-from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.geometry.se3 import residuals
 from geomoe3d.result import RegistrationResult
 from geomoe3d.types import BoolArray, FloatArray, IntArray
+
+WEIGHT_THRESHOLD = 0.5
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class RegistrationView:
     target_colors: FloatArray | None = None
     groups: IntArray | None = None
     group_names: tuple[str, ...] = ()
-    weight_threshold: float = 0.5
+    weight_threshold: float = WEIGHT_THRESHOLD
 
     def __post_init__(self) -> None:
         _check_shape("source_points", self.source_points, (None, 3))
@@ -77,8 +79,8 @@ class RegistrationView:
         """(K,) distance of each moved source point to its target point, cloud units; NaN if no transform."""
         if not self.has_transform:
             return np.full(len(self.correspondences), np.nan)
-        moved = transform_points(self.result.T_target_source, self.correspondences[:, :3])
-        return np.asarray(np.linalg.norm(moved - self.correspondences[:, 3:], axis=1))
+        rows = self.correspondences
+        return residuals(self.result.T_target_source, rows[:, :3], rows[:, 3:])
 
     def kept(self) -> BoolArray:
         """(K,) True where the filter keeps a correspondence; without weights, where the transform agrees.

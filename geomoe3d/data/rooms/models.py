@@ -33,7 +33,7 @@ _WORDS: dict[str, tuple[str, ...]] = {
     "washbasin": ("washbasin", "wash basin", "sink", "basin"),
     "bathtub": ("bathtub", "bath tub", "tub", "shower"),
     "toilet": ("toilet", "wc", "bidet"),
-    "coffee table": ("coffee table", "low table", "coffee-table"),
+    "coffee table": ("coffee table", "low table"),
     "sofa": ("sofa", "couch", "armchair", "loveseat"),
     "bed": ("bed", "crib", "bunk"),
     "chair": ("chair", "stool", "bench", "seat"),

@@ -8,10 +8,10 @@ from geomoe3d.data.rooms.pieces import Piece, Shelf, color, fronts, legs
 from geomoe3d.data.rooms.solids import Solids
 
 
-def table(rng: np.random.Generator, width: tuple[float, float] = (0.8, 1.8)) -> Piece:
+def table(rng: np.random.Generator) -> Piece:
     """A dining, work or coffee table, rectangular or round."""
     s, c = Solids(), color(rng)
-    w, d, h = float(rng.uniform(*width)), float(rng.uniform(0.6, 0.95)), float(rng.uniform(0.70, 0.77))
+    w, d, h = float(rng.uniform(0.8, 1.8)), float(rng.uniform(0.6, 0.95)), float(rng.uniform(0.70, 0.77))
     thick = float(rng.uniform(0.02, 0.05))
     if rng.random() < 0.2:
         w = d = float(rng.uniform(0.7, 1.2))
@@ -106,10 +106,10 @@ def office_chair(rng: np.random.Generator) -> Piece:
     return Piece("office chair", s, w + 0.1, w + 0.1, seat + back, [])
 
 
-def sofa(rng: np.random.Generator, seats: int | None = None) -> Piece:
+def sofa(rng: np.random.Generator) -> Piece:
     """An armchair to a three-seater, with cushions."""
     s, c = Solids(), color(rng)
-    n = int(rng.integers(1, 4)) if seats is None else seats
+    n = int(rng.integers(1, 4))
     arm, d = float(rng.uniform(0.12, 0.26)), float(rng.uniform(0.75, 1.0))
     w = n * float(rng.uniform(0.55, 0.75)) + 2 * arm
     seat, back = float(rng.uniform(0.36, 0.46)), float(rng.uniform(0.7, 0.95))

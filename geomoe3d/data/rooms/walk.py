@@ -207,8 +207,8 @@ def is_free(scene: Scene, eye: FloatArray, clearance: float) -> bool:
 def _score(rng: np.random.Generator, scene: Scene, stand: Stand, settings: WalkSettings) -> float:
     """How much a person would want to record this view: 0 for an unusable one.
 
-    Counts what lies in the cube of a fragment (0.5 to 3.5 m ahead, 1.5 m to the sides), and prefers views
-    in which no single plane is everything.
+    Counts the pixels that a fragment would keep (0.5 to 3.5 m ahead, not grazed), and prefers views in which
+    no single plane is everything.
     """
     hits = cast(scene.rays, _FINDER, stand.pose)
     usable = (hits.depth > 0.5) & (hits.depth < 3.5) & (hits.slope > 0.1)

@@ -1,0 +1,200 @@
+"""What a batch writes into its folder, and how its own files are told from those of the user.
+
+A folder is that of a batch by its ``run.json``, a page by its generator, a transform by its comments. What is
+not a batch's own is never replaced nor removed: it is refused before work begins, or left where it is.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.journal import Journal
+from geomoe3d.result import RegistrationResult
+from geomoe3d.transform_files import save_transform
+
+RUN_FILE, JOURNAL_FILE, RESULTS_FILE = "run.json", "journal.jsonl", "results.jsonl"
+PAGE_FILE, TRANSFORMS_FOLDER = "page.html", "transforms"
+FORMAT = "geomoe3d batch 1"
+PAGE_MARK = '<meta name="generator" content="geomoe3d batch">'
+
+_KIND = "geomoe3d batch "
+_HEAD_BYTES = 4096  # marks stand in the first lines
+_LONGEST_NAME = 255  # bytes, of nearly every file system
+_TRANSFORM_HEAD = re.compile(
+    r"# maps SOURCE \(.*\) into TARGET \(.*\): p_target = R p_source \+ t\r?\n"
+    r"# status \w+, confidence [\d.]+\r?\n(?:# pair (.*?)\r?\n)?[^#]"
+)
+
+
+def read_identity(folder: Path) -> dict[str, Any] | None:
+    """What the answers of the batch in a folder depend on; None where no batch was begun.
+
+    Raises:
+        FormatError: its ``run.json`` is damaged, or of something else.
+    """
+    path = folder / RUN_FILE
+    try:
+        identity = dict(json.loads(path.read_text(encoding="utf-8"))["identity"])
+        if str(identity.get("format")).startswith(_KIND):
+            return identity
+        found = f"its format is {identity.get('format')!r}"
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = repr(error)
+    raise FormatError(
+        f"'{path}' does not describe a batch of geomoe3d ({found}); give another folder, or move the file"
+    )
+
+
+def check_can_be_folder(path: Path, what: str) -> Path:
+    """The nearest folder of a path that is there: the path itself, or in what it is to be made.
+
+    Args:
+        path: of a folder, there or to be made.
+        what: what is said of it where it cannot be one.
+
+    Raises:
+        OutputError: a file is in the way.
+    """
+    try:
+        there = next(place for place in (path, *path.parents) if place.exists())
+    except OSError as error:  # e.g. a name too long
+        raise OutputError(f"cannot make the folder '{path}': {error.strerror}") from None
+    if not there.is_dir():
+        raise OutputError(f"'{there}' is a file; {what}")
+    return there
+
+
+def check_extras(folder: Path, ids: Iterable[str], *, transforms: bool, page: bool) -> None:
+    """Refuse to write a page or transforms over what is not of a batch, before work begins.
+
+    Args:
+        folder: of the batch, there or not.
+        ids: of its pairs.
+        transforms: whether transforms are going to be written.
+        page: whether a page is.
+
+    Raises:
+        InputError: a file that is not of a batch has such a name, or an id is too long to name a file.
+    """
+    path = folder / PAGE_FILE
+    if page and path.exists() and not has_mark(path, PAGE_MARK):
+        raise InputError(f"{foreign(path)}, or leave the page out")
+    place = folder / TRANSFORMS_FOLDER
+    if not transforms:
+        return
+    if place.exists() and not place.is_dir():
+        raise InputError(f"{foreign(place)}, or leave the transforms out")
+    for name in ids:
+        path = place / transform_name(name)
+        length = len(path.name.encode())
+        if length > _LONGEST_NAME:
+            raise InputError(
+                f"the id '{name}' makes a file name of {length} bytes, at most {_LONGEST_NAME} are possible; "
+                "give shorter ones in the column id, or leave the transforms out"
+            )
+        if path.exists() and not _is_own_transform(path):
+            raise InputError(f"{foreign(path)}, or leave the transforms out")
+
+
+def foreign(path: Path, what: str = "a batch") -> str:
+    """The beginning of a refusal to overwrite a file."""
+    return f"'{path}' is not of {what} of geomoe3d and would be overwritten; move it or give another folder"
+
+
+def has_mark(path: Path, mark: str) -> bool:
+    """Whether a file holds a mark in its first lines."""
+    return mark.encode() in _head(path)
+
+
+def remove_batch(folder: Path) -> None:
+    """Delete what a batch left of its own; nothing else in the folder is touched, nor what is no batch.
+
+    Raises:
+        FormatError: as `read_identity`.
+        OutputError: a file cannot be removed, or another process is writing the journal.
+    """
+    if read_identity(folder) is None:
+        return
+    if (folder / JOURNAL_FILE).is_file():
+        Journal(folder / JOURNAL_FILE).close()  # refused while another process holds it
+    place = folder / TRANSFORMS_FOLDER
+    remove([path for path in _files(place) if _is_own_transform(path)])
+    if place.is_dir() and not any(place.iterdir()):
+        place.rmdir()
+    if has_mark(folder / PAGE_FILE, PAGE_MARK):
+        remove([folder / PAGE_FILE])
+    # The last one says whose the others are.
+    remove([folder / name for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE)])
+
+
+def remove(paths: Iterable[Path]) -> None:
+    """Delete files, if they are there.
+
+    Raises:
+        OutputError: one cannot be removed.
+    """
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot remove '{path}': {error.strerror}") from None
+
+
+def transform_name(name: str) -> str:
+    """The file of the transform of a pair: its id, odd characters as %XX."""
+    return f"{quote(name, safe=' +=,@')}.txt"
+
+
+def write_transforms(folder: Path, results: Iterable[tuple[str, RegistrationResult]]) -> None:
+    """One text file per pair; those that an earlier call wrote of other pairs are removed.
+
+    Args:
+        folder: made if missing.
+        results: id and answer of the pairs that have a transform.
+
+    Raises:
+        OutputError: a file cannot be written or removed.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
+    written = set()
+    for name, result in results:
+        path = folder / transform_name(name)
+        names = f"SOURCE ({result.source.name}) into TARGET ({result.target.name})"
+        comments = [
+            f"maps {names}: p_target = R p_source + t",
+            f"status {result.status}, confidence {result.confidence:.4f}",
+            f"pair {path.stem}",
+        ]
+        save_transform(path, result.T_target_source, comments, force=True)
+        written.add(path.name)
+    remove([path for path in _files(folder) if path.name not in written and _is_own_transform(path)])
+
+
+def _is_own_transform(path: Path) -> bool:
+    """By its comments, which name its pair: a copy under another name is the user's."""
+    found = _TRANSFORM_HEAD.match(_head(path).decode("utf-8", "replace"))
+    return found is not None and found[1] in (None, " ".join(path.stem.split()))
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file; none where it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(_HEAD_BYTES)
+    except OSError:
+        return b""

@@ -44,6 +44,39 @@ def test_save_aligned_moves_everything(tmp_path: Path, suffix: str) -> None:
         np.testing.assert_allclose(moved.colors, colors[kept], atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["ascii", "binary", "csv", "pcd", "las"])
+def test_what_is_not_carried_over_is_named(tmp_path: Path, kind: str) -> None:
+    points = np.round(cloud(20), 6)
+    rows = "\n".join(f"{x} {y} {z} 7 2" for x, y, z in points)
+    header = "ply\nformat {} 1.0\nelement vertex 20\n" + "".join(
+        f"property double {name}\n" for name in ("x", "y", "z", "intensity", "label")
+    )
+    path = tmp_path / f"a.{kind if kind in ('csv', 'pcd', 'las') else 'ply'}"
+    if kind == "ascii":
+        path.write_text(header.format("ascii") + "end_header\n" + rows + "\n")
+    elif kind == "binary":
+        values = np.column_stack([points, np.full((20, 2), 7.0)]).astype("<f8")
+        path.write_bytes(header.format("binary_little_endian").encode() + b"end_header\n" + values.tobytes())
+    elif kind == "csv":
+        path.write_text("x,y,z,intensity,label\n" + rows.replace(" ", ",") + "\n")
+    elif kind == "pcd":
+        head = "VERSION .7\nFIELDS x y z intensity label\nSIZE 8 8 8 8 8\nTYPE F F F F F\nCOUNT 1 1 1 1 1\n"
+        path.write_text(head + "WIDTH 20\nHEIGHT 1\nPOINTS 20\nDATA ascii\n" + rows + "\n")
+    else:
+        laspy = pytest.importorskip("laspy")
+        save_points(path, points)
+        held = laspy.read(path)
+        held.intensity[:] = 7
+        held.write(path)
+    expected = ("intensity",) if kind == "las" else ("intensity", "label")
+    assert save_aligned(tmp_path / "b.ply", path, np.eye(4)) == expected
+    save_points(tmp_path / "c.ply", points, normals=unit_vectors(20))
+    assert save_aligned(tmp_path / "d.ply", tmp_path / "c.ply", np.eye(4)) == ()
+    assert save_aligned(tmp_path / "d.npy", tmp_path / "c.ply", np.eye(4)) == ("normals",)
+    np.savez(tmp_path / "e.npz", points=points, time=np.zeros(20))
+    assert save_aligned(tmp_path / "f.ply", tmp_path / "e.npz", np.eye(4)) == ("time",)
+
+
 @pytest.mark.parametrize("source_suffix", [".obj", ".stl", ".ply", ".glb"])
 @pytest.mark.parametrize("suffix", WRITABLE_MESH_SUFFIXES)
 @pytest.mark.parametrize("center", [np.zeros(3), UTM], ids=["near", "far"])

@@ -177,7 +177,8 @@ def _write(
     from geomoe3d.cli.summary import direction
     from geomoe3d.transform_files import has_transform, save_result
 
-    skipped = []
+    skipped: list[str] = []
+    lost: tuple[str, ...] = ()
     if outputs.transform is not None:
         answer = result.inverse() if inverse else result
         comments = [
@@ -191,7 +192,7 @@ def _write(
         if has_transform(result):
             from geomoe3d.clouds.io import save_aligned
 
-            save_aligned(outputs.aligned, source, result.T_target_source, force=force)
+            lost = save_aligned(outputs.aligned, source, result.T_target_source, force=force)
         else:
             skipped.append(outputs.aligned)
     if explanation is not None and (outputs.picture is not None or outputs.page is not None):
@@ -208,5 +209,7 @@ def _write(
             from geomoe3d.visual.page import save_page
 
             save_page(view, outputs.page, force=force)
+    if lost:
+        click.echo(f"not carried over to {outputs.aligned}: {', '.join(lost)}", err=True)
     for path in skipped:
         click.echo(f"not written, for want of a transform: {path}", err=True)

@@ -41,6 +41,12 @@ _MESH_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
     ".off": meshes.write_off,
     ".stl": meshes.write_stl,
 }
+_LACKING = {  # what a format cannot hold
+    ".npy": ("normals", "colors"),
+    ".obj": ("normals",),
+    ".off": ("normals", "colors"),
+    ".stl": ("colors",),  # its normals are those of the triangles
+}
 WRITABLE_SUFFIXES = tuple(_CLOUD_WRITERS)
 WRITABLE_MESH_SUFFIXES = (*_MESH_WRITERS, ".glb")
 
@@ -130,19 +136,22 @@ def save_points(
 
 def save_aligned(
     path: str | os.PathLike[str], source: Any, T_target_source: ArrayLike, *, force: bool = False
-) -> None:
+) -> tuple[str, ...]:
     """Write the source at full resolution in the target's file coordinates: p_target = R p_source + t.
 
     All finite points are moved, with their normals (turned) and colours; other attributes of the file are
-    not carried over, and NPY holds the points only. A mesh written to PLY, OBJ, OFF, STL or GLB stays a
-    mesh: its triangles are moved, GLB keeps materials, PLY normals and colours, OBJ colours. A mesh written
-    to another suffix becomes the points that `load_points` takes from it.
+    not carried over, NPY holds the points only, and what is lost is returned by name. A mesh written to PLY,
+    OBJ, OFF, STL or GLB stays a mesh: its triangles are moved, GLB keeps materials, PLY normals and colours,
+    OBJ colours. A mesh written to another suffix becomes the points that `load_points` takes from it.
 
     Args:
         path: a suffix of `save_points`, or for meshes .obj, .off, .stl or .glb.
         source: anything `load_points` takes.
         T_target_source: (4, 4) rigid motion in file coordinates.
         force: replace an existing file, which may be the source itself.
+
+    Returns:
+        Names of what the source says of its points and the written file does not.
 
     Raises:
         InputError: no rigid motion, or a source that cannot be used (as `load_points`).
@@ -174,6 +183,10 @@ def save_aligned(
             _CLOUD_WRITERS[suffix](handle, RawCloud(cloud.points, cloud.normals, cloud.colors))
 
     _write(path, fill, force)
+    if as_mesh and suffix == ".glb":
+        return ()
+    lacking = [name for name in _LACKING.get(suffix, ()) if getattr(raw, name) is not None]
+    return (*raw.unread, *lacking)
 
 
 def _moved(raw: RawCloud, T: FloatArray) -> RawCloud:

@@ -68,6 +68,7 @@ def read_npz(path: Path) -> RawCloud:
                     f"keys known: {', '.join(_POINT_KEYS)}"
                 )
             arrays = [None if key is None else archive[key] for key in wanted]
+            unread = tuple(key for key in archive.files if key not in wanted)
     except (FormatError, MemoryError, OSError):
         raise
     except Exception as error:  # zipfile and zlib have many ways to refuse
@@ -85,6 +86,7 @@ def read_npz(path: Path) -> RawCloud:
         cloud.points,
         cloud.normals if normals is None else np.asarray(normals, dtype=np.float64),
         cloud.colors if colors is None else scale_colors(colors),
+        unread=(*cloud.unread, *unread),
     )
 
 

@@ -33,9 +33,7 @@ def read_e57(path: Path) -> RawCloud:
     try:
         import pye57
     except ImportError:
-        raise DependencyError(
-            "E57 files need pye57, which is not installed: pip install 'geomoe3d[e57]'"
-        ) from None
+        raise DependencyError("E57 files need pye57, which is not installed: pip install pye57") from None
     _check_size(path)
     try:
         with pye57.E57(str(path)) as file:

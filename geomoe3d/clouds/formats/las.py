@@ -20,10 +20,10 @@ def _laspy(compressed: bool) -> Any:
         import laspy
     except ImportError:
         raise DependencyError(
-            "LAS and LAZ files need laspy, which is not installed: pip install 'geomoe3d[las]'"
+            "LAS and LAZ files need laspy, which is not installed: pip install 'laspy[lazrs]'"
         ) from None
     if compressed and not laspy.LazBackend.detect_available():
-        raise DependencyError("LAZ files need lazrs, which is not installed: pip install 'geomoe3d[las]'")
+        raise DependencyError("LAZ files need lazrs, which is not installed: pip install 'laspy[lazrs]'")
     return laspy
 
 
@@ -64,7 +64,9 @@ def read_las(path: Path) -> RawCloud:
         colors = scale_colors(stored) if stored.any() else None
     if "normals" in groups:
         normals = np.stack([np.asarray(las[names[k]], dtype=np.float64) for k in groups["normals"]], axis=1)
-    return RawCloud(points, normals, colors)
+    read = {"X", "Y", "Z", "red", "green", "blue", *(names[k] for k in groups.get("normals", ()))}
+    others = [name for name in names if name not in read]  # each format has them all; zeros say nothing
+    return RawCloud(points, normals, colors, unread=tuple(n for n in others if np.asarray(las[n]).any()))
 
 
 def _wrong_count(path: Path, said: int, held: int) -> FormatError:

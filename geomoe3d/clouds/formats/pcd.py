@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,6 +23,7 @@ from geomoe3d.clouds.formats.raw import (
     header_count,
     read_columns,
     scale_colors,
+    unread_names,
 )
 from geomoe3d.clouds.formats.text import DataLines, parse_table
 from geomoe3d.clouds.recentre import fits_single_precision
@@ -69,7 +70,7 @@ def read_pcd(path: Path) -> RawCloud:
         if any(header.counts[k] != 1 for columns in groups.values() for k in columns):
             raise FormatError(f"'{path}': coordinates, normals and colours need COUNT 1")
         if header.data == "binary_compressed":
-            return _read_compressed(handle, path, header)
+            return replace(_read_compressed(handle, path, header), unread=_unread(header.names, groups))
         if header.data == "ascii":
             columns = _read_ascii(handle, path, header, groups)
         else:
@@ -79,7 +80,13 @@ def read_pcd(path: Path) -> RawCloud:
         colors = scale_colors(columns["colors"])
     elif "packed" in columns:
         colors = _unpack(columns["packed"])
-    return RawCloud(columns["points"], columns.get("normals"), colors)
+    unread = _unread(header.names, groups)
+    return RawCloud(columns["points"], columns.get("normals"), colors, unread=unread)
+
+
+def _unread(names: list[str], groups: dict[str, list[int]]) -> tuple[str, ...]:
+    """Without ``_``, the name of padding."""
+    return tuple(name for name in unread_names(names, groups) if name != "_")
 
 
 def _read_header(handle: BinaryIO, path: Path) -> _Header:

@@ -21,6 +21,7 @@ from geomoe3d.clouds.formats.raw import (
     header_count,
     read_columns,
     scale_colors,
+    unread_names,
 )
 from geomoe3d.clouds.formats.text import DataLines, parse_table
 from geomoe3d.errors import FormatError
@@ -68,10 +69,13 @@ def read_ply(path: Path) -> RawCloud:
             raise FormatError(f"'{path}': the vertices have no properties x, y, z, only: {found}")
         if vertex.has_lists:
             raise FormatError(f"'{path}': vertices with list properties are not supported")
+        unread = unread_names([name for name, _, _ in vertex.properties], groups)
         if order == "=":
             with io.TextIOWrapper(handle, encoding="latin-1") as text:
-                return _read_ascii(DataLines(text, num_lines), path, elements, groups)
-        return _read_binary(handle, path, order, elements, groups)
+                cloud = _read_ascii(DataLines(text, num_lines), path, elements, groups)
+        else:
+            cloud = _read_binary(handle, path, order, elements, groups)
+    return replace(cloud, unread=unread)
 
 
 def _read_header(handle: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:

@@ -43,12 +43,14 @@ class RawCloud:
         normals: (N, 3) as stored, any length, or None.
         colors: (N, 3) in [0, 1], or None.
         faces: (M, 3) triangles as rows of ``points``, or None for a cloud.
+        unread: names of what else the file says of its points, such as intensity.
     """
 
     points: FloatArray
     normals: FloatArray | None = None
     colors: FloatArray | None = None
     faces: IntArray | None = None
+    unread: tuple[str, ...] = ()
 
     def take(self, rows: NDArray[np.bool_]) -> RawCloud:
         """The points of a mask with their normals and colours; faces are given up."""
@@ -56,6 +58,7 @@ class RawCloud:
             self.points[rows],
             None if self.normals is None else self.normals[rows],
             None if self.colors is None else self.colors[rows],
+            unread=self.unread,
         )
 
 
@@ -72,6 +75,12 @@ def columns_by_name(names: Sequence[str]) -> dict[str, list[int]]:
         if min(columns) >= 0:
             found[group] = columns
     return found
+
+
+def unread_names(names: Sequence[str], groups: Mapping[str, Sequence[int]]) -> tuple[str, ...]:
+    """Names of the columns that are in no group."""
+    read = {column for columns in groups.values() for column in columns}
+    return tuple(name for column, name in enumerate(names) if column not in read)
 
 
 def split_columns(table: FloatArray, names: Sequence[str] | None) -> RawCloud:
@@ -94,7 +103,8 @@ def split_columns(table: FloatArray, names: Sequence[str] | None) -> RawCloud:
     points = table if table.shape[1] == 3 else np.ascontiguousarray(table[:, groups["points"]])
     normals = table[:, groups["normals"]] if "normals" in groups else None
     colors = scale_colors(table[:, groups["colors"]]) if "colors" in groups else None
-    return RawCloud(points, normals, colors)
+    named = names if names is not None else [f"column {k + 1}" for k in range(table.shape[1])]
+    return RawCloud(points, normals, colors, unread=unread_names(named, groups))
 
 
 def _guess_role(triple: FloatArray) -> str | None:

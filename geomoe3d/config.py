@@ -11,7 +11,7 @@ import difflib
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from geomoe3d.errors import ConfigError
 
@@ -68,6 +68,12 @@ class FilterConfig(Section):
     weights: str | None = Field(
         None, description="trained weights of geomoe: a .safetensors file or a shipped name"
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> FilterConfig:
+        if self.weights is not None and self.name not in ("auto", "geomoe"):
+            raise ValueError(f"weights '{self.weights}' are given, but the filter '{self.name}' takes none")
+        return self
 
 
 class EstimatorConfig(Section):

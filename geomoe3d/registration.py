@@ -132,7 +132,10 @@ class Registrar:
         return self.explain(source, target, initial=initial, progress=progress).result
 
     def register_many(self, pairs: Iterable[tuple[Any, Any]]) -> Iterator[RegistrationResult]:
-        """One result per (source, target), in order, as they are finished."""
+        """One result per (source, target), in order, as they are finished.
+
+        A cloud that cannot be used raises as in `register` and ends it; `geomoe3d.register_pairs` goes on.
+        """
         for source, target in pairs:
             yield self.register(source, target)
 

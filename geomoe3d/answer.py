@@ -45,6 +45,11 @@ class Findings:
         nothing = Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, 0)
         return cls(np.full((4, 4), np.nan), None, np.inf, None, nothing, Judgement("failed", (reason,), 0.0))
 
+    def motions(self) -> list[Hypothesis]:
+        """The answer and the alternative, as far as there are any."""
+        answer = [] if self.evidence is None else [Hypothesis(self.T_target_source, 0.0, 0)]
+        return answer if self.alternative is None else [*answer, replace(self.alternative, verdict=None)]
+
     def with_note(self, note: str) -> Findings:
         """The same findings with one more sentence among the reasons."""
         return replace(self, judgement=replace(self.judgement, reasons=(*self.judgement.reasons, note)))

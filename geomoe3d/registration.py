@@ -190,7 +190,7 @@ class Registrar:
         if viewpoints is None and self._asks_flipped(seen.findings.judgement):
             clock("describe")
             turned = flip_normals(described[0], config.preparation), replace(described[1], viewpoint=None)
-            other = self._look(turned, None, initial, clock, flipped=True)
+            other = self._look(turned, None, initial, clock, rivals=seen.findings)
             if other.findings.judgement.confidence > seen.findings.judgement.confidence:
                 seen = other
         described, matched, weighed, findings = seen
@@ -210,13 +210,15 @@ class Registrar:
         initial: ArrayLike | None,
         clock: StageClock,
         *,
-        flipped: bool = False,
+        rivals: Findings | None = None,
     ) -> _Look:
         """From described clouds to a judged answer; a doubtful one with hypotheses of coarser grids too.
 
-        ``flipped``: the source's normals were turned over, and are to be on coarser grids as well.
+        ``rivals``: what an earlier look found. This one then has the source's normals turned over, and is to
+        have them so on coarser grids; its answer must beat what was found before, as in repeated structure.
         """
         config, voxel_size = self.config, described[0].voxel_size
+        flipped = rivals is not None
         threshold = config.estimator.inlier_threshold * voxel_size
         matched, weighed, hypotheses = self.propose(described, clock, viewpoints)
         with single_blas_thread():
@@ -224,6 +226,8 @@ class Registrar:
                 described, matched, threshold, config, clock, self._ask_about(matched, voxel_size)
             )
             chooser.consider(hypotheses)
+            if rivals is not None:
+                chooser.consider(rivals.motions())
             if initial is not None:
                 chooser.consider_guess(initial)
             findings = chooser.conclude()

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from headless_browser import browse
+from headless_browser import HAND, browse, check_card_without_ink, check_hand, turned_by_hand
 from report_runs import NASTY, Document, report
 from scipy.spatial.transform import Rotation
 
@@ -109,16 +109,13 @@ def test_many_failures_share_the_points(two_runs, monkeypatch):
 # ---------------------------------------------------------------- in a browser
 USE = r"""
 (async () => {
-  const settle = () => new Promise((done) => setTimeout(done, 200));
   const body = document.body, log = {};
   const note = async (name) => { await settle(); log[name] = { ...body.dataset }; };
   await note("start");
   const card = document.querySelector("#card-0"), stage = card.querySelector(".stage");
-  stage.setPointerCapture = () => {};
-  const pointer = (kind, clientX) => stage.dispatchEvent(
-    new PointerEvent("pointer" + kind, { bubbles: true, pointerId: 1, clientX, clientY: 50, buttons: 1 }));
-  pointer("down", 100); pointer("move", 150); pointer("up", 150); await note("turned");
-  stage.dispatchEvent(new KeyboardEvent("keydown", { key: "+" })); await note("zoomed");
+  const { key, pointer } = handOn(stage);
+  pointer("down", 1, 100); pointer("move", 1, 150); pointer("up", 1, 150); await note("turned");
+  key("+"); await note("zoomed");
   card.querySelector('input[value="truth"]').click(); await note("truth");
   card.querySelector('[data-side="top"]').click(); await note("top");
   const pixels = stage.querySelector("canvas").getContext("2d").getImageData(0, 0, 300, 200).data;
@@ -137,7 +134,7 @@ USE = r"""
 @pytest.mark.parametrize("webgl", [True, False])
 def test_gallery_turns_in_a_browser(two_runs, tmp_path, webgl):
     text = report(*two_runs, num_failures=2)
-    found = browse(tmp_path, text, script=USE, webgl=webgl, window="500,700")
+    found = browse(tmp_path, text, script=HAND + USE, webgl=webgl, window="500,700")
     assert "error" not in found
     assert (found["ready"], found["cards"], found["drawn"]) == ("true", "2", "2")
     assert found["renderer"] == ("webgl2" if webgl else "canvas2d")
@@ -151,3 +148,18 @@ def test_gallery_turns_in_a_browser(two_runs, tmp_path, webgl):
     assert log["tints"] > 10
     assert log["shown"][0] > 5
     assert log["shown"] == [log["shown"][0], 0, log["shown"][0]]
+
+
+@pytest.mark.parametrize("webgl", [True, False])
+def test_gallery_obeys_the_hand(two_runs, tmp_path, webgl):
+    text = report(*two_runs, num_failures=2)
+    card = Document(text).data["0"]
+    radius = card["fits"]["estimate"]["radius"]
+    views = turned_by_hand(tmp_path, text, webgl=webgl)["views"]
+    # Digits are the page's own, and so is the wheel until a view is chosen.
+    own = {"digits": False, "wheel_always": False}
+    check_hand(views, card["axes"], radius, pitch=0.5, per_pixel=0.009, limits=(0.05, 20.0), **own)
+
+
+def test_gallery_draws_without_a_card_that_draws_nothing(two_runs, tmp_path):
+    check_card_without_ink(tmp_path, report(*two_runs, num_failures=2))

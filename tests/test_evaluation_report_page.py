@@ -126,7 +126,7 @@ def test_everything_given_is_escaped(pairs):
     score = replace(score, info=replace(score.info, **bad, identity={NASTY: NASTY}))
     document = Document(report((score, named, predictions)))
     assert document.count("b") == 1  # the tick of the median, nothing of the names
-    assert len(document.scripts) == 3
+    assert len(document.scripts) == 4
     assert " ".join(NASTY.split()) in document.words
     assert document.data.keys() == {"0", "1", "2", "3", "4", "5"}
 

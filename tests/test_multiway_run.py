@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import inspect
 import json
 import shutil
@@ -12,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from headless_browser import HAND, browse, check_card_without_ink, check_hand, turned_by_hand
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from small_scans import SETTINGS, UTM
@@ -113,6 +115,10 @@ def pose_of(words):
     return make_transform(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
 
 
+def page_data(page):
+    return json.loads(page.split('type="application/json">', 1)[1].split("</script>", 1)[0])
+
+
 def test_the_page_is_self_contained_and_lists_every_scan(model):
     page = (model.folder / "page.html").read_text()
     assert page == render_model_page(model)
@@ -122,9 +128,47 @@ def test_the_page_is_self_contained_and_lists_every_scan(model):
     assert "src=" not in page
     assert "http" not in page.replace("http-equiv", "")
     assert "{{" not in page
-    data = json.loads(page.split('type="application/json">', 1)[1].split("</script>", 1)[0])
+    data = page_data(page)
     assert len(data["clouds"]) == 5
     assert data["lines"]["classes"][0]["drawn"] == sum(edge.kept for edge in model.edges)
+
+
+@pytest.mark.parametrize("webgl", [True, False], ids=["webgl2", "canvas2d"])
+def test_the_page_obeys_the_hand(model, tmp_path, webgl):
+    page = render_model_page(model)
+    log, data = turned_by_hand(tmp_path, page, webgl=webgl), page_data(page)
+    check_hand(log["views"], data["axes"], data["radius"], pitch=0.6)
+    why = "the graphics card was lost" if webgl else "no WebGL 2"
+    assert log["notice"] == f"Drawn without a graphics card ({why}): slower, otherwise the same."
+
+
+def test_the_page_draws_without_a_card_that_draws_nothing(model, tmp_path):
+    said = check_card_without_ink(tmp_path, render_model_page(model))
+    assert said == "Drawn without a graphics card (it drew nothing): slower, otherwise the same."
+
+
+def test_the_page_shows_the_scans_and_edges_that_are_chosen(model, tmp_path):
+    page = render_model_page(model)
+    script = """
+(async () => {
+  const log = [], { dataset } = document.body;
+  const note = async () => { await settle(); log.push([dataset.drawnPoints, dataset.drawnLines]); };
+  await note();
+  for (const one of ["#none", '[data-scan="scan_1"]', "#classes input", "#all"]) {
+    document.querySelector(one).click();
+    await note();
+  }
+  dataset.log = JSON.stringify(log);
+})();
+"""
+    seen = browse(tmp_path, page, script=HAND + script, wish="?renderer=canvas2d&side=top")
+    assert "error" not in seen, seen["error"]
+    assert (seen["ready"], seen["renderer"]) == ("true", "canvas2d")
+    data = page_data(page)
+    sizes = {cloud["name"]: len(base64.b64decode(cloud["points"])) // 12 for cloud in data["clouds"]}
+    num, edges = sum(sizes.values()), data["lines"]["classes"][0]["drawn"]
+    shown = [(num, edges), (0, edges), (sizes["scan_1"], edges), (sizes["scan_1"], 0), (num, 0)]
+    assert json.loads(seen["log"]) == [[str(points), str(lines)] for points, lines in shown]
 
 
 def test_adding_a_scan_reuses_every_earlier_pair(scanned_room, tmp_path):

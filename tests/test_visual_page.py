@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from headless_browser import browse
+from headless_browser import HAND, browse, check_card_without_ink, check_hand, turned_by_hand
 from registration_views import NASTY, UTM, make_result, nasty_view, room_view, without_transform
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -57,7 +57,7 @@ def test_page_keeps_user_text_as_text_and_asks_no_network():
     page = Page(text)
     assert page.open == []
     tags = [tag for tag, _ in page.elements]
-    assert tags.count("script") == 3
+    assert tags.count("script") == 4
     assert "img" not in tags and "i" in tags  # the only <i> is the page's own colour scale
     joined = "".join(data for tag, data in page.texts if tag not in ("script", "style"))
     for words in (
@@ -148,14 +148,9 @@ def test_page_is_small_and_repeatable(tmp_path):
 # Uses the page as a person would and notes what it says it drew after each step.
 USE = r"""
 (async () => {
-  const body = document.body, byId = (id) => document.getElementById(id), stage = byId("stage"), log = {};
-  stage.setPointerCapture = () => {};
-  const settle = () => new Promise((done) => setTimeout(done, 100));
+  const body = document.body, byId = (id) => document.getElementById(id), log = {};
+  const { key } = handOn(byId("stage"));
   const note = async (name) => { await settle(); log[name] = { ...body.dataset }; };
-  const send = (Kind, name, more) => stage.dispatchEvent(new Kind(name, { bubbles: true, ...more }));
-  const key = (key, more) => send(KeyboardEvent, "keydown", { key, ...more });
-  const pointer = (kind, pointerId, clientX) =>
-    send(PointerEvent, "pointer" + kind, { pointerId, clientX, clientY: 200, buttons: 1 });
   const slide = (id, value) => { byId(id).value = value; byId(id).dispatchEvent(new Event("input")); };
   await note("start");
   for (const at of [0, 0.25, 0.5, 1]) { slide("progress", at); await note("at" + at); }
@@ -163,10 +158,6 @@ USE = r"""
   key("ArrowUp", { shiftKey: true }); await note("moved");
   key("+"); await note("zoomed");
   key("1"); await note("top");
-  pointer("down", 1, 100); pointer("move", 1, 150); pointer("up", 1, 150); await note("dragged");
-  pointer("down", 1, 100); pointer("down", 2, 200); pointer("move", 2, 300); await note("pinched");
-  pointer("up", 1, 0); pointer("up", 2, 0);
-  send(WheelEvent, "wheel", { deltaY: 50, cancelable: true }); await note("wheeled");
   byId("show-source").click(); await note("hidden");
   byId("show-source").click();
   byId("classes").querySelector("input").click(); await note("lines");
@@ -194,7 +185,7 @@ def camera(entry: dict[str, str]) -> np.ndarray:
 @pytest.mark.parametrize("webgl", [True, False], ids=["webgl2", "canvas2d"])
 def test_page_in_a_browser(tmp_path, webgl):
     view = nasty_view()
-    seen = browse(tmp_path, render_page(view), script=USE, webgl=webgl)
+    seen = browse(tmp_path, render_page(view), script=HAND + USE, webgl=webgl)
     assert "error" not in seen, seen["error"]
     assert seen["ready"] == "true"
     assert seen["renderer"] == ("webgl2" if webgl else "canvas2d")
@@ -229,9 +220,20 @@ def test_page_in_a_browser(tmp_path, webgl):
     top = camera(log["top"])
     assert top[pitch] == pytest.approx(np.pi / 2, rel=1e-5)
     np.testing.assert_allclose(top[3:], start[3:])
-    assert camera(log["dragged"])[yaw] == pytest.approx(-50 * 0.007, rel=1e-4)
-    assert camera(log["pinched"])[distance] == pytest.approx(top[distance] / 2, rel=1e-3)
-    assert camera(log["wheeled"])[distance] > camera(log["pinched"])[distance]
+
+
+@pytest.mark.parametrize("webgl", [True, False], ids=["webgl2", "canvas2d"])
+def test_page_obeys_the_hand(tmp_path, webgl):
+    text = render_page(nasty_view())
+    log, data = turned_by_hand(tmp_path, text, webgl=webgl), Page(text).data()
+    check_hand(log["views"], data["axes"], data["radius"], pitch=0.5)
+    why = "the graphics card was lost" if webgl else "no WebGL 2"
+    assert log["notice"] == f"Drawn without a graphics card ({why}): slower, otherwise the same."
+
+
+def test_page_draws_without_a_card_that_draws_nothing(tmp_path):
+    said = check_card_without_ink(tmp_path, render_page(nasty_view()))
+    assert said == "Drawn without a graphics card (it drew nothing): slower, otherwise the same."
 
 
 def test_page_without_transform_shows_only_before(tmp_path):
@@ -240,7 +242,7 @@ def test_page_without_transform_shows_only_before(tmp_path):
     assert "No transform was found" in text
     assert "data-copy" not in "".join(str(attributes) for _, attributes in Page(text).elements)
     script = "document.body.dataset.locked = document.getElementById('progress').disabled"
-    seen = browse(tmp_path, text, script=script, wish="at=1&renderer=canvas2d&color=distance")
+    seen = browse(tmp_path, text, script=script, wish="#at=1&renderer=canvas2d&color=distance")
     assert "error" not in seen
     assert seen["locked"] == "true"
     assert seen["drawn-points"] == str(len(view.source_points) + len(view.target_points))

@@ -8,10 +8,8 @@ about 0.3 s per failure shown, the rest a fraction of a second.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +39,7 @@ from geomoe3d.evaluation.report_tables import (
 )
 from geomoe3d.evaluation.report_words import LEGEND, benchmark_rank, run_key, warnings
 from geomoe3d.files import write_atomically
-from geomoe3d.visual.page import embed_json
+from geomoe3d.visual.page import fill_page
 
 
 def save_report(
@@ -106,9 +104,13 @@ def render_report(
     members = [score for group in groups.values() for score in group]
     runs = {label: number for number, label in enumerate(dict.fromkeys(s.info.label for s in members))}
     gallery, clouds = _gallery(groups, pairs, predictions, num_failures)
+    made_by = escape(f"geomoe3d {__version__}")
+    date = escape(made or datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"))
     values = {
-        "made_by": escape(f"geomoe3d {__version__}"),
-        "made": escape(made or datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")),
+        "generator": f'<meta name="generator" content="{made_by}">',
+        "title": f"Registration evaluation, {date}",
+        "made_by": made_by,
+        "made": date,
         "contents": _contents(groups, bool(comparisons)),
         "summary": escape(_summary(groups)),
         "warnings": _warnings(members),
@@ -121,13 +123,8 @@ def render_report(
         "comparisons": _comparisons(comparisons),
         "gallery": gallery,
         "provenance": "".join(provenance_of(score) for score in members),
-        "style": _part("report.css"),
-        "draw_script": _part("page_draw.js", "geomoe3d.visual"),
-        "script": _part("report.js"),
-        "data": embed_json(clouds),
     }
-    # One pass: a label that holds {{data}} stays a label.
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], _part("report.html"))
+    return fill_page("geomoe3d.evaluation", "report", values, clouds)
 
 
 def _check(
@@ -275,7 +272,3 @@ def _gallery_words(score: RunScore, shown: int) -> str:
     if all(pair.confidence is None for pair in score.pairs):
         order = "by overlap, as the run states no confidence"
     return f"Run {name} is wrong on {count:,} of {len(score.pairs):,} pairs; shown: {shown:,}, {order}."
-
-
-def _part(name: str, package: str = "geomoe3d.evaluation") -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")

@@ -1,17 +1,13 @@
 """One self-contained page to turn a model of many scans in, each in its colour, with the edges between them.
 
-It draws with the same script as the page of one pair (WebGL 2, or a plain canvas), asks nothing of any
-network, and lists every scan and its fate in plain HTML. At most 300,000 points are embedded: 5 MB.
+It draws and turns with the scripts of the page of one pair (WebGL 2, or a plain canvas), asks nothing of
+any network, and lists every scan and its fate in plain HTML. At most 300,000 points are embedded: 5 MB.
 """
 
 from __future__ import annotations
 
-import base64
 import colorsys
 import html
-import json
-import re
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +18,7 @@ from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
 from geomoe3d.types import FloatArray
+from geomoe3d.visual.page import base64_floats, fill_page
 from geomoe3d.visual.scene import thin
 from geomoe3d.visual.upright import upright_axes
 
@@ -50,10 +47,11 @@ def render_model_page(model: SceneModel) -> str:
     axes, _ = upright_axes(clouds[0]["raw"] if clouds else points, np.random.default_rng(0))
     data = {
         "clouds": [
-            {"name": c["name"], "color": c["color"], "points": _floats(c["raw"] - center)} for c in clouds
+            {"name": c["name"], "color": c["color"], "points": base64_floats(c["raw"] - center)}
+            for c in clouds
         ],
         "lines": {
-            "vertices": _floats(lines["vertices"] - np.tile(center, 2)),
+            "vertices": base64_floats(lines["vertices"] - np.tile(center, 2)),
             "classes": lines["classes"],
         },
         "axes": axes.tolist(),
@@ -62,18 +60,13 @@ def render_model_page(model: SceneModel) -> str:
     }
     placed = sum(len(group.poses) for group in model.groups)
     values = {
-        "mark": PAGE_MARK,
+        "generator": PAGE_MARK,
         "title": f"{placed} of {len(model.scans)} scans placed",
         "summary": _summary(model, placed),
         "scans": _scan_list(model, colors),
         "edges": _edge_list(model),
-        "style": _part("geomoe3d.multiway", "page.css"),
-        "draw_script": _part("geomoe3d.visual", "page_draw.js"),
-        "script": _part("geomoe3d.multiway", "page.js"),
-        "data": _embed(data),
     }
-    template = _part("geomoe3d.multiway", "page.html")
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], template)
+    return fill_page("geomoe3d.multiway", "page", values, data)
 
 
 def _clouds(model: SceneModel, colors: dict[str, str]) -> tuple[list[dict[str, Any]], dict[str, FloatArray]]:
@@ -168,16 +161,3 @@ def _edge_list(model: SceneModel) -> str:
 def _color(number: int) -> str:
     r, g, b = colorsys.hls_to_rgb((0.58 + _GOLDEN * number) % 1.0, 0.5 + 0.1 * (number % 3 - 1), 0.7)
     return f"#{round(255 * r):02x}{round(255 * g):02x}{round(255 * b):02x}"
-
-
-def _floats(values: FloatArray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
-
-
-def _embed(data: dict[str, Any]) -> str:
-    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
-
-
-def _part(package: str, name: str) -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")

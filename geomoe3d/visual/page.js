@@ -1,26 +1,12 @@
 "use strict";
-/* State, camera and controls of the page. Everything shown comes from the JSON block; text that a user can
-   influence only ever enters the document as textContent. */
-
-function report(problem) {
-  document.body.dataset.error = String((problem && problem.message) || problem);
-  const notice = document.getElementById("notice");
-  notice.textContent = "The 3D view failed: " + document.body.dataset.error;
-  notice.hidden = false;
-}
-window.addEventListener("error", (event) => report(event.error || event.message));
-window.addEventListener("unhandledrejection", (event) => report(event.reason));
+/* State and controls of the page of one registration; drawing is page_draw.js, the camera page_view.js. Everything
+   shown comes from the JSON block; text that a user can influence only ever enters the document as textContent. */
 
 (() => {
   const byId = (id) => document.getElementById(id);
   const data = JSON.parse(byId("data").textContent);
   const wish = new URLSearchParams(location.hash.slice(1)); // e.g. #at=0&color=distance&side=top&renderer=canvas2d
   const stage = byId("stage");
-
-  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  const floats = (text) => new Float32Array(bytes(text).buffer);
-  const parseColor = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16));
-  const styleColor = (name) => parseColor(getComputedStyle(document.documentElement).getPropertyValue(name).trim());
 
   /* ---------- data ---------- */
   const clouds = {};
@@ -34,27 +20,13 @@ window.addEventListener("unhandledrejection", (event) => report(event.reason));
   }
   const distances = {};
   for (const [name, text] of Object.entries(data.distances)) distances[name] = text ? bytes(text) : null;
-  const lines = { vertices: floats(data.lines.vertices), ends: null, colors: null, ranges: [] };
-  const numLines = lines.vertices.length / 6;
-  lines.ends = Float32Array.from({ length: 2 * numLines }, (_, i) => i % 2);
-  lines.colors = new Uint8Array(6 * numLines);
-  let first = 0;
-  for (const kind of data.lines.classes) {
-    lines.ranges.push([first, kind.drawn]);
-    const color = parseColor(kind.color);
-    for (let i = 6 * first; i < 6 * (first + kind.drawn); i++) lines.colors[i] = color[i % 3];
-    first += kind.drawn;
-  }
+  const lines = unpackLines(data.lines);
 
   /* ---------- state ---------- */
   const state = {
-    progress: data.motions.answer ? 1 : 0, motion: "answer", color: "cloud", size: 0, cut: 0,
-    source: true, target: true, classes: data.lines.classes.map((kind) => kind.shown),
-    yaw: -0.6, pitch: 0.5, distance: 1, center: [0, 0, 0], fitted: true, playing: false,
+    progress: data.motions.answer ? 1 : 0, motion: "answer", color: "cloud", size: 0,
+    source: true, target: true, classes: data.lines.classes.map((kind) => kind.shown), playing: false,
   };
-  const FIELD = 40 * Math.PI / 180;
-  const SIDES = { home: [-0.6, 0.5], top: [0, Math.PI / 2], front: [0, 0], side: [Math.PI / 2, 0] };
-  const [right, forward, up] = data.axes;
 
   /* ---------- rigid motion ---------- */
   // Row-major 4x4 -> [unit quaternion w x y z, translation].
@@ -99,61 +71,16 @@ window.addEventListener("unhandledrejection", (event) => report(event.reason));
     return compose(slerp(q0, q1, s), t0.map((v, i) => (1 - s) * v + s * t1[i]));
   }
 
-  /* ---------- camera ---------- */
-  function axesOfCamera() {
-    const [cy, sy, cp, sp] = [Math.cos(state.yaw), Math.sin(state.yaw), Math.cos(state.pitch), Math.sin(state.pitch)];
-    const across = right.map((v, i) => cy * v + sy * forward[i]);
-    const level = forward.map((v, i) => cy * v - sy * right[i]);
-    const look = level.map((v, i) => cp * v - sp * up[i]); // into the picture
-    const above = level.map((v, i) => sp * v + cp * up[i]);
-    return [across, above, look];
-  }
-  function cameraMatrices(width, height) {
-    const [across, above, look] = axesOfCamera();
-    const eye = state.center.map((v, i) => v - state.distance * look[i]);
-    const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    const view = Float64Array.of(
-      across[0], above[0], -look[0], 0, across[1], above[1], -look[1], 0, across[2], above[2], -look[2], 0,
-      -dot(across, eye), -dot(above, eye), dot(look, eye), 1);
-    const open = state.cut ? state.distance + (2.2 * state.cut - 1.1) * data.radius : 0;
-    const near = Math.max(0.02 * state.distance, 1e-4 * data.radius, open), far = state.distance + 40 * data.radius;
-    const focal = 1 / Math.tan(FIELD / 2);
-    const projection = new Float64Array(16);
-    projection[0] = focal * height / width;
-    projection[5] = focal;
-    projection[10] = (far + near) / (near - far);
-    projection[11] = -1;
-    projection[14] = 2 * far * near / (near - far);
-    return { view, projection, near, far, pixelsPerUnit: focal * height / 2 };
-  }
-  function goTo(side) {
-    [state.yaw, state.pitch] = SIDES[side];
-    state.fitted = true;
-    invalidate();
-  }
+  /* ---------- camera and canvas ---------- */
+  const display = new Display(clouds, lines, { stage, draw, repaint: paint });
+  const invalidate = () => display.invalidate();
+  const camera = new Camera(stage, {
+    axes: data.axes, radius: data.radius, sides: { home: [-0.6, 0.5], ...SIDES }, changed: invalidate,
+  });
   // Until the user moves or zooms, the view follows both clouds on their way from before to after.
   function fit() {
     const from = data.fits.before, to = data.fits[state.motion] || from, s = state.progress;
-    const narrow = Math.min(1, stage.clientWidth / Math.max(1, stage.clientHeight));
-    state.center = from.center.map((v, i) => (1 - s) * v + s * to.center[i]);
-    state.distance = 1.05 * ((1 - s) * from.radius + s * to.radius) / Math.sin(FIELD / 2) / narrow;
-  }
-  function turn(dx, dy) {
-    state.yaw -= dx;
-    state.pitch = Math.min(Math.PI / 2, Math.max(-Math.PI / 2, state.pitch + dy));
-    invalidate();
-  }
-  function move(dx, dy) { // in pixels of the stage
-    state.fitted = false;
-    const unit = 2 * state.distance * Math.tan(FIELD / 2) / Math.max(1, stage.clientHeight);
-    const [across, above] = axesOfCamera();
-    state.center = state.center.map((v, i) => v + unit * (-dx * across[i] + dy * above[i]));
-    invalidate();
-  }
-  function zoom(factor) {
-    state.fitted = false;
-    state.distance = Math.min(40 * data.radius, Math.max(0.02 * data.radius, state.distance * factor));
-    invalidate();
+    camera.fit(from.center.map((v, i) => (1 - s) * v + s * to.center[i]), (1 - s) * from.radius + s * to.radius);
   }
 
   /* ---------- colours ---------- */
@@ -172,64 +99,28 @@ window.addEventListener("unhandledrejection", (event) => report(event.reason));
       const values = name === "source" && state.color === "distance" ? distances[state.motion] : null;
       if (state.color === "file" && cloud.file) cloud.colors = cloud.file.slice();
       else {
-        cloud.colors = new Uint8Array(cloud.points.length);
-        for (let i = 0; i < cloud.points.length; i += 3) cloud.colors.set(values ? RAMP[values[i / 3]] : plain, i);
+        cloud.colors = oneColor(cloud.points.length, plain);
+        if (values) for (let i = 0; i < cloud.points.length; i += 3) cloud.colors.set(RAMP[values[i / 3]], i);
       }
-      renderer.recolor(name, cloud.colors);
+      display.renderer.recolor(name, cloud.colors);
     }
     byId("scale").hidden = state.color !== "distance";
     invalidate();
   }
 
   /* ---------- drawing ---------- */
-  let renderer = null, canvas = null, waiting = false, checked = false;
-  function start(Kind) {
-    if (canvas) canvas.remove();
-    canvas = document.createElement("canvas");
-    canvas.setAttribute("aria-hidden", "true");
-    stage.prepend(canvas);
-    renderer = new Kind(canvas, clouds, lines);
-    document.body.dataset.renderer = renderer.kind;
-    canvas.addEventListener("webglcontextlost", () => startPlain("the graphics card was lost"));
-  }
-  function startPlain(why) {
-    start(PlainRenderer);
-    const notice = byId("notice");
-    notice.textContent = `Drawn without a graphics card (${why}): slower, otherwise the same.`;
-    notice.hidden = false;
-    paint();
-  }
-  function invalidate() {
-    if (!waiting) { waiting = true; requestAnimationFrame(draw); }
-  }
   function draw(time) {
-    waiting = false;
     if (state.playing) advance(time);
-    if (state.fitted) fit();
-    const ratio = Math.min(renderer.kind === "webgl2" ? 2 : 1, window.devicePixelRatio || 1);
-    const width = Math.max(1, Math.round(stage.clientWidth * ratio)), height = Math.max(1, Math.round(stage.clientHeight * ratio));
-    const model = sourceModel(), camera = cameraMatrices(width, height);
-    const still = Float64Array.of(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1);
-    const shown = [["source", model], ["target", still]].filter(([name]) => state[name]).map(([name, m]) => ({ name, model: m }));
-    const background = styleColor("--stage");
-    renderer.draw({ ...camera, model, clouds: shown, classes: state.classes, background,
-      diameter: 2 * data.spacing * 2 ** state.size }, width, height, ratio);
-    const num = shown.reduce((sum, { name }) => sum + clouds[name].points.length / 3, 0);
-    if (!checked) {
-      checked = true;
-      const covered = renderer.covered(background);
-      document.body.dataset.covered = covered.toFixed(4);
-      if (covered === 0 && num > 0 && renderer.kind === "webgl2") { // a driver that accepts everything and draws nothing
-        checked = false;
-        startPlain("it drew nothing");
-        return;
-      }
-    }
+    if (camera.fitted) fit();
+    const model = sourceModel();
+    const shown = [["source", model], ["target", STILL]].filter(([name]) => state[name]).map(([name, m]) => ({ name, model: m }));
+    const num = display.show(camera, { model, clouds: shown, classes: state.classes, diameter: 2 * data.spacing * 2 ** state.size });
+    if (num === null) return;
     // What was drawn, for tests and for whoever scripts the page.
     document.body.dataset.drawnPoints = String(num);
     document.body.dataset.drawnLines = String(state.classes.reduce((sum, on, i) => sum + (on ? lines.ranges[i][1] : 0), 0));
     document.body.dataset.model = Array.from(model, (v) => v.toPrecision(12)).join(" ");
-    document.body.dataset.camera = [state.yaw, state.pitch, state.distance, ...state.center].map((v) => v.toPrecision(6)).join(" ");
+    document.body.dataset.camera = [camera.yaw, camera.pitch, camera.distance, ...camera.center].map((v) => v.toPrecision(6)).join(" ");
     document.body.dataset.ready = "true";
   }
 
@@ -254,59 +145,15 @@ window.addEventListener("unhandledrejection", (event) => report(event.reason));
     invalidate();
   }
 
-  /* ---------- pointer, wheel, keys ---------- */
-  const fingers = new Map();
-  stage.addEventListener("pointerdown", (event) => {
-    if (event.target !== stage && event.target !== canvas) return;
-    fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    stage.setPointerCapture(event.pointerId);
-    stage.focus({ preventScroll: true });
-  });
-  stage.addEventListener("pointermove", (event) => {
-    const old = fingers.get(event.pointerId);
-    if (!old) return;
-    const now = [event.clientX, event.clientY], dx = now[0] - old[0], dy = now[1] - old[1];
-    if (fingers.size === 2) {
-      const other = [...fingers].find(([id]) => id !== event.pointerId)[1];
-      const span = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
-      zoom(Math.max(1, span(old)) / Math.max(1, span(now)));
-      move(dx / 2, dy / 2);
-    } else if (event.shiftKey || event.buttons & 6) move(dx, dy);
-    else turn(dx * 0.007, dy * 0.007);
-    fingers.set(event.pointerId, now);
-  });
-  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
-    stage.addEventListener(name, (event) => fingers.delete(event.pointerId));
-  }
-  stage.addEventListener("contextmenu", (event) => event.preventDefault());
-  stage.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    zoom(Math.exp(Math.max(-60, Math.min(60, event.deltaMode === 1 ? 18 * event.deltaY : event.deltaY)) * 0.0025));
-  }, { passive: false });
-  stage.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.altKey || event.metaKey) return;
-    const arrows = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-    if (arrows[event.key]) {
-      const [x, y] = arrows[event.key];
-      if (event.shiftKey) move(30 * x, 30 * y);
-      else turn(0.09 * x, 0.09 * y);
-    } else if (event.key === "+" || event.key === "=") zoom(0.87);
-    else if (event.key === "-" || event.key === "_") zoom(1.15);
-    else if ("0123".includes(event.key)) goTo(["home", "top", "front", "side"][Number(event.key)]);
-    else if (event.key === " ") play(!state.playing);
-    else return;
-    event.preventDefault();
-  });
-
   /* ---------- controls ---------- */
+  listen(camera, { keys: { ...camera.sideKeys(), " ": () => play(!state.playing) } });
   byId("progress").addEventListener("input", (event) => { play(false); state.progress = Number(event.target.value); invalidate(); });
   byId("play").addEventListener("click", () => play(!state.playing));
-  document.querySelectorAll("[data-side]").forEach((button) => button.addEventListener("click", () => goTo(button.dataset.side)));
   byId("controls").addEventListener("submit", (event) => event.preventDefault());
   byId("show-source").addEventListener("change", (event) => { state.source = event.target.checked; invalidate(); });
   byId("show-target").addEventListener("change", (event) => { state.target = event.target.checked; invalidate(); });
   byId("size").addEventListener("input", (event) => { state.size = Number(event.target.value); invalidate(); });
-  byId("cut").addEventListener("input", (event) => { state.cut = Number(event.target.value); invalidate(); });
+  byId("cut").addEventListener("input", (event) => { camera.cut = Number(event.target.value); invalidate(); });
   function choose(name, value) {
     const input = document.querySelector(`input[name="${name}"][value="${CSS.escape(value)}"]`);
     if (!input || input.closest("[hidden]")) return;
@@ -361,22 +208,16 @@ window.addEventListener("unhandledrejection", (event) => report(event.reason));
   }));
 
   /* ---------- begin ---------- */
-  try {
-    if (wish.get("renderer") === "canvas2d") throw new Error("as asked");
-    start(CardRenderer);
-  } catch (problem) {
-    startPlain(problem.message);
-  }
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
+  display.begin(wish);
   new ResizeObserver(invalidate).observe(stage);
-  goTo(SIDES[wish.get("side")] ? wish.get("side") : "home");
+  camera.goTo(wish.get("side"));
   if (wish.has("at") && data.motions.answer) {
     state.progress = Math.min(1, Math.max(0, Number(wish.get("at")) || 0));
     byId("progress").value = String(state.progress);
   }
   if (wish.has("cut")) {
-    state.cut = Math.min(1, Math.max(0, Number(wish.get("cut")) || 0));
-    byId("cut").value = String(state.cut);
+    camera.cut = Math.min(1, Math.max(0, Number(wish.get("cut")) || 0));
+    byId("cut").value = String(camera.cut);
   }
   for (const name of ["motion", "color"]) if (wish.has(name)) choose(name, wish.get(name));
   paint();

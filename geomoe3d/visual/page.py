@@ -3,7 +3,8 @@
 The page asks nothing of any network: style, script and points are inside it, and its own content security
 policy forbids everything else. It draws with WebGL 2 and falls back to a plain canvas. The numbers are in
 the HTML itself, readable without script. Cost: about a second; at most 50,000 points per cloud are
-embedded, so the file stays under 3 MB however large the clouds are.
+embedded, so the file stays under 3 MB however large the clouds are. `fill_page` makes the other pages with
+clouds to turn, too: a model of many scans, the report of an evaluation.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from geomoe3d.files import write_atomically
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray, IntArray
+from geomoe3d.visual.paper import number
 from geomoe3d.visual.scene import (
     GROUP_COLORS,
     KEPT_COLOR,
@@ -62,13 +64,15 @@ def render_page(view: RegistrationView) -> str:
     scene = build_scene(view, max_points=MAX_POINTS)
     result = view.result
     source, target = result.source.name, result.target.name
+    made_by = _escape(f"geomoe3d {result.versions.get('geomoe3d', '')}".strip())
     values = {
-        "made_by": _escape(f"geomoe3d {result.versions.get('geomoe3d', '')}".strip()),
+        "generator": f'<meta name="generator" content="{made_by}">',
+        "made_by": made_by,
         "title": _escape(f"{source} on {target}: {STATUS_WORDS[result.status]}"),
         "stage_label": _escape(f"Point clouds {source} and {target}, {STATUS_WORDS[result.status]}"),
         "status": result.status,
         "status_words": STATUS_WORDS[result.status],
-        "confidence": _escape(f"confidence {_number(result.confidence, '.2f')}"),
+        "confidence": _escape(f"confidence {number(result.confidence, '.2f')}"),
         "source_name": _escape(source),
         "target_name": _escape(target),
         "reasons": _reasons(view),
@@ -76,13 +80,37 @@ def render_page(view: RegistrationView) -> str:
         "facts": _facts(view, scene),
         "timings": _timings(view),
         "drawn": _escape(_drawn(view, scene)),
-        "style": _part("page.css"),
-        "draw_script": _part("page_draw.js"),
-        "script": _part("page.js"),
-        "data": embed_json(_data(view, scene)),
     }
+    return fill_page("geomoe3d.visual", "page", values, _data(view, scene))
+
+
+def fill_page(package: str, name: str, values: dict[str, str], data: dict[str, Any]) -> str:
+    """The text of a self-contained page with clouds to turn.
+
+    Args:
+        package: with ``name``.html (the inside of the body), ``name``.css and ``name``.js.
+        name: of these files.
+        values: HTML for every {{word}} in the body, and "title" and "generator" for the head.
+        data: for the script, which finds it as JSON in the element "data".
+    """
+    shared = "geomoe3d.visual"
+    parts = {
+        **values,
+        "frame_style": _read(shared, "page_frame.css"),
+        "style": _read(package, f"{name}.css"),
+        "draw_script": _read(shared, "page_draw.js"),
+        "view_script": _read(shared, "page_view.js"),
+        "script": _read(package, f"{name}.js"),
+        "data": _embed_json(data),
+    }
+    template = _read(shared, "page_frame.html").replace("{{body}}", _read(package, f"{name}.html").rstrip())
     # One pass: a file name that holds {{data}} stays a file name.
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], _part("page.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], template)
+
+
+def base64_floats(values: FloatArray) -> str:
+    """Numbers as the scripts unpack them: little-endian float32 in base64."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
 
 
 def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
@@ -102,11 +130,11 @@ def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         matrices["alternative"] = result.alternative.T_target_source
     return {
         "source": {
-            "points": _base64_floats(scene.source),
+            "points": base64_floats(scene.source),
             "colors": _colors(view.source_colors, scene.source_rows),
         },
         "target": {
-            "points": _base64_floats(scene.target),
+            "points": base64_floats(scene.target),
             "colors": _colors(view.target_colors, scene.target_rows),
         },
         "lines": _lines(view, scene),
@@ -147,7 +175,7 @@ def _lines(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         for (label, color, mask), rows_of_kind in zip(kinds, chosen, strict=True)
         if mask.any()
     ]
-    return {"vertices": _base64_floats(ends), "classes": classes}
+    return {"vertices": base64_floats(ends), "classes": classes}
 
 
 def _fit(scene: Scene, motion: FloatArray) -> dict[str, Any]:
@@ -213,7 +241,7 @@ def _facts(view: RegistrationView, scene: Scene) -> str:
     result = view.result
     share = f" ({result.num_inliers / result.num_correspondences:.1%})" if result.num_correspondences else ""
     rows = [
-        ("overlap of source", _number(result.overlap, ".1%")),
+        ("overlap of source", number(result.overlap, ".1%")),
         ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences{share}"),
         ("inlier threshold", f"{result.inlier_threshold:.6g}"),
         ("voxel size", f"{result.voxel_size:.6g}"),
@@ -265,17 +293,13 @@ def _colors(colors: FloatArray | None, rows: IntArray) -> str | None:
     return None if colors is None else _base64_bytes(colors[rows])
 
 
-def _base64_floats(values: FloatArray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
-
-
 def _base64_bytes(values: NDArray[np.float64]) -> str:
     """Values in [0, 1] as 0 to 255; larger ones become 255, NaN becomes 0."""
     levels = np.round(255.0 * np.clip(np.nan_to_num(values, posinf=1.0), 0.0, 1.0)).astype(np.uint8)
     return base64.b64encode(np.ascontiguousarray(levels).tobytes()).decode("ascii")
 
 
-def embed_json(data: dict[str, Any]) -> str:
+def _embed_json(data: dict[str, Any]) -> str:
     """JSON for the inside of a script element: no character in it can end the element or open another."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
@@ -285,9 +309,5 @@ def _escape(text: str) -> str:
     return html.escape(text, quote=True)
 
 
-def _number(value: float, form: str) -> str:
-    return format(value, form) if np.isfinite(value) else "unknown"
-
-
-def _part(name: str) -> str:
-    return resources.files("geomoe3d.visual").joinpath(name).read_text(encoding="utf-8")
+def _read(package: str, name: str) -> str:
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")

@@ -187,6 +187,11 @@ def choose_rows(mask: np.ndarray[tuple[int], np.dtype[np.bool_]], most: int, see
     return np.sort(np.random.default_rng(seed).choice(rows, most, replace=False))
 
 
+def rgb(color: str) -> FloatArray:
+    """(3,) red, green and blue in [0, 1] of a colour #rrggbb."""
+    return np.array([int(color[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])
+
+
 def nice_length(length: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not longer than ``length`` (more than 0)."""
     power = 10.0 ** np.floor(np.log10(length))

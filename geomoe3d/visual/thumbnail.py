@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import SOURCE_COLOR, TARGET_COLOR
+from geomoe3d.visual.scene import SOURCE_COLOR, TARGET_COLOR, rgb
 
 Pixels = NDArray[np.uint8]
 _MARGIN = 0.04
@@ -37,7 +37,7 @@ def draw_clouds(
     pixels = np.zeros((height, width, 4), dtype=np.uint8)
     points = np.concatenate([*clouds, np.zeros((0, 3))])
     if len(points):
-        paint = np.array([_rgb(color) for color in colors], dtype=np.uint8)
+        paint = np.round([255.0 * rgb(color) for color in colors]).astype(np.uint8)
         kind = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
         seen = points @ axes.T
         low, high = np.percentile(seen, [0.5, 99.5], axis=0)
@@ -83,7 +83,3 @@ def _splat(
     order = np.flatnonzero(inside)[np.argsort(nearness[inside], kind="stable")]
     pixels[row[order], column[order], :3] = paint[kind[order]]
     pixels[row[order], column[order], 3] = 255
-
-
-def _rgb(color: str) -> tuple[int, int, int]:
-    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

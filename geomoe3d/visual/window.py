@@ -27,6 +27,7 @@ from geomoe3d.visual.scene import (
     Scene,
     build_scene,
     choose_rows,
+    rgb,
 )
 from geomoe3d.visual.view import RegistrationView
 
@@ -166,7 +167,7 @@ class WindowContent:
             if self.own_colors and own is not None:
                 cloud.colors = self._vectors(own)
             else:
-                cloud.paint_uniform_color(_rgb(plain))
+                cloud.paint_uniform_color(rgb(plain))
         starts = transform_points(self.motion, self._starts)
         self.lines.points = self._vectors(np.concatenate([starts, self._ends]))
         self.lines.lines = self._pairs if self.lines_shown else self._no_pairs
@@ -207,17 +208,13 @@ def check_display() -> None:
 def _chosen_lines(view: RegistrationView) -> tuple[Any, FloatArray]:
     """Rows of the correspondences that are drawn, and the colour of each."""
     if view.groups is not None:
-        palette = np.array([_rgb(color) for color in GROUP_COLORS])
+        palette = np.array([rgb(color) for color in GROUP_COLORS])
         colors = palette[view.groups % len(palette)]
         mask = np.ones(len(view.correspondences), dtype=bool)
     else:
         kept = view.kept()
-        colors = np.where(kept[:, None], _rgb(KEPT_COLOR), _rgb(REJECTED_COLOR))
+        colors = np.where(kept[:, None], rgb(KEPT_COLOR), rgb(REJECTED_COLOR))
         mask = kept if kept.any() else ~kept
     mask = mask & np.isfinite(view.correspondences).all(axis=1)
     rows = choose_rows(mask, MAX_LINES, view.result.seed)
     return rows, colors[rows]
-
-
-def _rgb(color: str) -> FloatArray:
-    return np.array([int(color[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])

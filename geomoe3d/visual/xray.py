@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import SOURCE_COLOR, TARGET_COLOR
+from geomoe3d.visual.scene import SOURCE_COLOR, TARGET_COLOR, rgb
 
 
 def xray(
@@ -33,7 +33,7 @@ def xray(
     for points, color in ((source, SOURCE_COLOR), (target, TARGET_COLOR)):
         position = (points - (center - half)) / unit - 0.5
         ink = _ink(position, rows, columns, float(np.clip(0.7 * spacing / unit, 0.6, 2.5)))
-        paper *= 1.0 - ink[:, :, None] * (1.0 - _rgb(color))
+        paper *= 1.0 - ink[:, :, None] * (1.0 - rgb(color))
     return paper[::-1]
 
 
@@ -59,7 +59,3 @@ def _ink(position: FloatArray, rows: int, columns: int, blur: float) -> FloatArr
     # A typical surface seen face-on takes 45 % of the ink; one seen edge-on, many times as dense, all of it.
     ink = 1.0 - np.exp(-0.6 * smooth / np.median(inked))
     return np.asarray(np.round(48.0 * ink) / 48.0)  # finer steps cannot be seen and double the file
-
-
-def _rgb(color: str) -> FloatArray:
-    return np.array([int(color[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])

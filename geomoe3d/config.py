@@ -116,6 +116,12 @@ class SecondLookConfig(Section):
         description="coarser grids, in voxels, on which further hypotheses are sought when the first answer "
         "is doubtful; none: the first answer stands",
     )
+    max_correspondences: int = Field(
+        3500,
+        ge=0,
+        description="so many matches of the grid itself are asked for further hypotheses, where there are "
+        "more than the first answer had; 0: none",
+    )
     below: float = Field(
         0.8, ge=0, le=1, description="an answer that is not ok is doubtful below this confidence"
     )

@@ -232,6 +232,7 @@ class Registrar:
                 chooser.consider_guess(initial)
             findings = chooser.conclude()
             if self._is_doubtful(findings.judgement):
+                chooser.consider(self.propose_from_more(described, len(matched), clock, viewpoints))
                 for grid in config.second_look.grids:
                     size = grid * voxel_size
                     more = self.propose_on_grid(size, described, clock, viewpoints, flipped=flipped)
@@ -270,11 +271,22 @@ class Registrar:
         described: tuple[PreparedCloud, PreparedCloud],
         clock: StageClock,
         viewpoints: tuple[FloatArray, FloatArray] | None = None,
+        most: int | None = None,
     ) -> tuple[Correspondences, FilterOutput, list[Hypothesis]]:
-        """Match, weigh and solve; ``viewpoints`` are where the sensors are believed to have stood."""
+        """Match, weigh and solve.
+
+        Args:
+            described: both clouds.
+            clock: told of the stages.
+            viewpoints: where the sensors are believed to have stood, local coordinates.
+            most: matches used; None takes what the configuration says.
+        """
         config, voxel_size = self.config, described[0].voxel_size
         clock("match")
-        matched = match(*described, config.matching, seed=config.seed, with_ratio=self._wants_ratio)
+        matching = config.matching
+        if most is not None:
+            matching = matching.model_copy(update={"max_correspondences": most})
+        matched = match(*described, matching, seed=config.seed, with_ratio=self._wants_ratio)
         matched = replace(matched, viewpoints=viewpoints)
         clock("weigh")
         if self._shows_motions:  # that comes later: those that the clouds like best
@@ -287,6 +299,25 @@ class Registrar:
             self._estimator, matched, weighed, config.estimator, inlier_threshold=threshold, seed=config.seed
         )
         return matched, weighed, found
+
+    def propose_from_more(
+        self,
+        described: tuple[PreparedCloud, PreparedCloud],
+        known: int,
+        clock: StageClock,
+        viewpoints: tuple[FloatArray, FloatArray] | None = None,
+    ) -> list[Hypothesis]:
+        """Hypotheses from more matches of the same grid than the ``known`` ones.
+
+        None where there are no more.
+        """
+        most = self.config.second_look.max_correspondences
+        if (
+            most <= self.config.matching.max_correspondences
+            or known < self.config.matching.max_correspondences
+        ):
+            return []
+        return self.propose(described, clock, viewpoints, most)[2]
 
     def propose_on_grid(
         self,
@@ -313,10 +344,11 @@ class Registrar:
         return self.propose((source, target), clock, viewpoints)[2]
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
-        """Whether a second look is to be taken, on coarser grids."""
+        """Whether a second look is to be taken, at more matches and on coarser grids."""
         look = self.config.second_look
         doubtful = judgement.status != "ok" and judgement.confidence < look.below
-        return doubtful and self.config.verification.enabled and len(look.grids) > 0
+        wanted = len(look.grids) > 0 or look.max_correspondences > 0
+        return doubtful and self.config.verification.enabled and wanted
 
     def _asks_flipped(self, judgement: Judgement) -> bool:
         """Whether, no sensor being known, the pair is asked again with the source's normals turned over.

@@ -311,11 +311,8 @@ class Registrar:
 
         None where there are no more.
         """
-        most = self.config.second_look.max_correspondences
-        if (
-            most <= self.config.matching.max_correspondences
-            or known < self.config.matching.max_correspondences
-        ):
+        usual, most = self.config.matching.max_correspondences, self.config.second_look.max_correspondences
+        if known < usual or most <= usual:
             return []
         return self.propose(described, clock, viewpoints, most)[2]
 

@@ -161,14 +161,20 @@ def test_distinct_motions_are_told_apart(pair):
 
 @pytest.fixture
 def grids_seen(monkeypatch):
-    """Edges of the grids on which hypotheses were sought, all with the same places of the sensors."""
+    """Edges of the grids on which hypotheses were sought, all with the same places of the sensors.
+
+    Where more matches of a grid were asked for than usual, its edge is followed by their number.
+    """
     seen: list[float] = []
     propose = Registrar.propose
 
-    def spy(self, described, clock, viewpoints=None):
+    def spy(self, described, clock, viewpoints=None, most=None):
+        found = propose(self, described, clock, viewpoints, most)
         seen.append(round(described[0].voxel_size / VOXEL, 6))
+        if most is not None:
+            seen.append(len(found[0]))
         np.testing.assert_array_equal(viewpoints, np.zeros((2, 3)))
-        return propose(self, described, clock, viewpoints)
+        return found
 
     monkeypatch.setattr(Registrar, "propose", spy)
     return seen
@@ -192,16 +198,26 @@ def test_an_answer_not_ok_but_likely_takes_no_second_look(grids_seen):
     assert grids_seen == [1]
 
 
-def test_an_unsure_answer_takes_one_on_every_coarser_grid(grids_seen):
+def test_an_unsure_answer_takes_one_at_more_matches_and_on_every_coarser_grid(grids_seen):
     source, target, T = make_sample_pair(seed=0)
-    settings = [f"voxel_size={VOXEL}", *UNSURE]
-    result = Registrar(load_config(None, settings)).register(source, target)
-    assert grids_seen == [1, 1.5, 2]
+    settings = [f"voxel_size={VOXEL}", *UNSURE, "matching.max_correspondences=500"]
+    few = [*settings, "second_look.max_correspondences=700"]
+    result = Registrar(load_config(None, few)).register(source, target)
+    assert grids_seen == [1, 1, 700, 1.5, 2]
     assert rotation_error_deg(result.T_target_source, T) < 1
     assert result.voxel_size == VOXEL
     grids_seen.clear()
-    Registrar(load_config(None, [*settings, "second_look.grids=[]"])).register(source, target)
-    assert grids_seen == [1]
+    Registrar(load_config(None, [*few, "second_look.grids=[]"])).register(source, target)
+    assert grids_seen == [1, 1, 700]
+    for most in (0, 500):  # no more than there were
+        grids_seen.clear()
+        alone = [*settings, f"second_look.max_correspondences={most}"]
+        Registrar(load_config(None, alone)).register(source, target)
+        assert grids_seen == [1, 1.5, 2]
+    grids_seen.clear()
+    every = [f"voxel_size={VOXEL}", *UNSURE, "matching.max_correspondences=100000"]
+    Registrar(load_config(None, every)).register(source, target)
+    assert grids_seen == [1, 1.5, 2]
 
 
 def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatch):
@@ -214,7 +230,7 @@ def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatc
 
     monkeypatch.setattr(Registrar, "describe_cloud", small)
     source, target, _ = make_sample_pair(seed=0)
-    settings = [f"voxel_size={VOXEL}", *UNSURE]
+    settings = [f"voxel_size={VOXEL}", *UNSURE, "second_look.max_correspondences=0"]
     assert Registrar(load_config(None, settings)).register(source, target).status != "failed"
     assert grids_seen == [1]
 

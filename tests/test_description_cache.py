@@ -229,7 +229,8 @@ def test_a_rough_guess_alone_is_refined_and_chosen():
     source, target, T = make_sample_pair(seed=0)
     rough = T.copy()
     rough[:3, 3] += [0.04, -0.03, 0.02]
-    starved = load_config(None, ["matching.max_correspondences=3", "estimator.name=svd"])
+    few = ["matching.max_correspondences=3", "second_look.max_correspondences=0"]
+    starved = load_config(None, [*few, "estimator.name=svd"])
     assert not Registrar(starved).register(source.file_points, target.file_points).ok
     found = Registrar(starved).register(source.file_points, target.file_points, initial=rough)
     assert np.abs(found.T_target_source - T).max() < 0.01

@@ -73,6 +73,7 @@ updated, measures = updater.step(iter(loader), 1.0, 0.0, torch.device("cpu"))
 assert updated
 if process.is_first:
     torch.save({n: p.grad for n, p in model.named_parameters()}, sys.argv[2])
+del wrapped, updater
 leave()
 """
 

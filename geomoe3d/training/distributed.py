@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from dataclasses import dataclass
 from datetime import timedelta
@@ -43,8 +44,9 @@ def join() -> Process:
 
 
 def leave() -> None:
-    """Leave the group, if in one."""
+    """Leave the group, if in one; let go before of what holds it, such as a model that shares gradients."""
     if dist.is_available() and dist.is_initialized():
+        gc.collect()  # held in a cycle the group's threads would outlive it, and abort the process as it ends
         dist.destroy_process_group()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.filters.base import FilterOutput
-from geomoe3d.geometry.se3 import inverse, residuals, rotation_angle_deg, shift_frames, transform_points
+from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames
 from geomoe3d.judge import Information, Judgement
 from geomoe3d.result import Alternative, CloudReport, RegistrationResult
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
@@ -170,13 +170,12 @@ def _alternative(findings: Findings, source: PreparedCloud, target: PreparedClou
     if findings.alternative is None:
         return None
     T = findings.alternative.T_target_source
-    centre = source.points.mean(0)[None]
-    apart = transform_points(T, centre) - transform_points(findings.T_target_source, centre)
+    shift, turn = motions_apart(findings.T_target_source, T, source.points.mean(0))
     return Alternative(
         T_target_source=shift_frames(T, source.origin, target.origin),
         relative_score=1 / findings.lead if findings.lead > 0 else 1.0,
-        rotation_difference_deg=rotation_angle_deg((inverse(findings.T_target_source) @ T)[:3, :3]),
-        translation_difference=float(np.linalg.norm(apart)),
+        rotation_difference_deg=turn,
+        translation_difference=shift,
     )
 
 

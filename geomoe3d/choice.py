@@ -17,16 +17,15 @@ from geomoe3d.answer import Findings
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.geometry.se3 import (
     check_motion,
+    motions_apart,
     residuals,
-    rotation_angle_deg,
     shift_frames,
-    transform_points,
 )
 from geomoe3d.judge import judge, lead_over, measure_information
 from geomoe3d.refine import Refiner
 from geomoe3d.stages import StageClock
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PreparedCloud
-from geomoe3d.verification import Evidence, Verifier, best_first, clearly_different, distinct
+from geomoe3d.verification import Evidence, Verifier, are_different, best_first, clearly_different, distinct
 
 if TYPE_CHECKING:
     from geomoe3d.filters.motion_judge import Judged
@@ -128,19 +127,10 @@ class Chooser:
         if self._guess is None:
             return None
         guess, source = self._guess, self._described[0]
-        evidence = self._verifier.evidence(guess)
-        if (
-            clearly_different([(Hypothesis(guess, 0.0, 0), evidence)], T_target_source, source, self._shift)
-            is None
-        ):
+        if not are_different(T_target_source, guess, source, self._shift):
             return None
-        centre = source.points.mean(0)[None]
-        shift = np.linalg.norm(transform_points(guess, centre) - transform_points(T_target_source, centre))
-        turn = rotation_angle_deg(T_target_source[:3, :3].T @ guess[:3, :3])
-        return (
-            f"the first guess is not the answer: refined, it lies {turn:.1f} deg and {shift:.3g} away, where "
-            "the clouds fit less well"
-        )
+        shift, turn = motions_apart(T_target_source, guess, source.points.mean(0))
+        return f"the first guess is not the answer: refined, it lies {turn:.1f} deg and {shift:.3g} away"
 
     def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
         """Show the network the distinct hypotheses that the clouds like best, and whatever leads after that.

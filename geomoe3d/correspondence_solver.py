@@ -103,11 +103,9 @@ class CorrespondenceSolver:
         nothing = np.full((4, 4), np.nan), np.zeros(len(rows), dtype=np.bool_), threshold
         if len(rows) < 3:
             return CorrespondenceResult(*nothing, FilterOutput(np.zeros(len(rows))))
-        origins = choose_origin(rows[:, :3]), choose_origin(rows[:, 3:])
-        local = rows - np.concatenate(origins)
         clock = StageClock()
         clock("weigh")
-        matched = Correspondences(local, viewpoints=believed_viewpoints(local, origins))
+        matched, origins = localised(rows)
         weighed = self.filter(matched, voxel_size=voxel_size, seed=seed)
         clock("solve")
         estimator = self.config.estimator
@@ -146,6 +144,13 @@ def register_correspondences(
         ConfigError, CheckpointError, DependencyError: as `CorrespondenceSolver`.
     """
     return CorrespondenceSolver(config)(correspondences, voxel_size=voxel_size)
+
+
+def localised(rows: FloatArray) -> tuple[Correspondences, tuple[FloatArray, FloatArray]]:
+    """Rows (N, 6), N >= 1, in local coordinates with the sensors believed, and the origin of each half."""
+    origins = choose_origin(rows[:, :3]), choose_origin(rows[:, 3:])
+    local = rows - np.concatenate(origins)
+    return Correspondences(local, viewpoints=believed_viewpoints(local, origins)), origins
 
 
 def check_rows(correspondences: ArrayLike | Correspondences) -> FloatArray:

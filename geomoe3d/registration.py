@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.answer import Findings, failed_result, finished_result
 from geomoe3d.choice import Chooser
 from geomoe3d.clouds.description_cache import DescriptionCache
-from geomoe3d.clouds.features import describe, flip_normals
+from geomoe3d.clouds.features import describe, flip_pair
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.matching import match
 from geomoe3d.clouds.prepare import (
@@ -26,9 +26,9 @@ from geomoe3d.clouds.prepare import (
     prepare,
     scale_mismatch,
 )
-from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints, known_viewpoints
+from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.correspondence_solver import check_length, check_rows
+from geomoe3d.correspondence_solver import check_length, check_rows, localised
 from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import solve
@@ -152,9 +152,7 @@ class Registrar:
             InputError: wrong shape, non-finite numbers, or no positive length.
         """
         rows, voxel_size = check_rows(correspondences), check_length(voxel_size, "voxel_size")
-        zero = np.zeros(3)
-        views = believed_viewpoints(rows, (zero, zero)) if len(rows) else None
-        given = Correspondences(rows, viewpoints=views)
+        given = localised(rows)[0] if len(rows) else Correspondences(rows)
         return self._filter(given, voxel_size=voxel_size, seed=self.config.seed).weights
 
     def explain(
@@ -189,8 +187,7 @@ class Registrar:
         seen = self._look(described, viewpoints, initial, clock)
         if viewpoints is None and self._asks_flipped(seen.findings.judgement):
             clock("describe")
-            turned = flip_normals(described[0], config.preparation), replace(described[1], viewpoint=None)
-            other = self._look(turned, None, initial, clock, rivals=seen.findings)
+            other = self._look(described, None, initial, clock, rivals=seen.findings)
             if other.findings.judgement.confidence > seen.findings.judgement.confidence:
                 seen = other
         described, matched, weighed, findings = seen
@@ -214,11 +211,13 @@ class Registrar:
     ) -> _Look:
         """From described clouds to a judged answer; a doubtful one with hypotheses of coarser grids too.
 
-        ``rivals``: what an earlier look found. This one then has the source's normals turned over, and is to
-        have them so on coarser grids; its answer must beat what was found before, as in repeated structure.
+        ``rivals``: what an earlier look found. This one then turns the source's normals over, on every grid,
+        and its answer must beat what was found before, as in repeated structure.
         """
-        config, voxel_size = self.config, described[0].voxel_size
+        config, voxel_size, as_seen = self.config, described[0].voxel_size, described
         flipped = rivals is not None
+        if flipped:
+            described = flip_pair(as_seen, config.preparation)
         threshold = config.estimator.inlier_threshold * voxel_size
         matched, weighed, hypotheses = self.propose(described, clock, viewpoints)
         with single_blas_thread():
@@ -235,7 +234,7 @@ class Registrar:
                 chooser.consider(self.propose_from_more(described, len(matched), clock, viewpoints))
                 for grid in config.second_look.grids:
                     size = grid * voxel_size
-                    more = self.propose_on_grid(size, described, clock, viewpoints, flipped=flipped)
+                    more = self.propose_on_grid(size, as_seen, clock, viewpoints, flipped=flipped)
                     chooser.consider(more)
                 findings = chooser.conclude(config.second_look.num_refined, config.second_look.num_judged)
         return _Look(described, matched, weighed, findings)
@@ -336,9 +335,8 @@ class Registrar:
             target = self.describe_cloud(clouds[1], voxel_size, views[1], clock)
         except EmptyCloudError:
             return []
-        if flipped:
-            source = flip_normals(source, self.config.preparation)
-        return self.propose((source, target), clock, viewpoints)[2]
+        pair = flip_pair((source, target), self.config.preparation) if flipped else (source, target)
+        return self.propose(pair, clock, viewpoints)[2]
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""

@@ -57,4 +57,4 @@ def remarks(
 
 def _is_one_file(given: tuple[Any, Any]) -> bool:
     paths = [Path(data) for data in given if isinstance(data, (str, os.PathLike))]
-    return len(paths) == 2 and paths[0].samefile(paths[1])
+    return len(paths) == 2 and paths[0].resolve() == paths[1].resolve()  # asks for no file that may be gone

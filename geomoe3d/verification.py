@@ -17,7 +17,7 @@ import numpy as np
 
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.errors import InputError
-from geomoe3d.geometry.se3 import rotation_angle_deg, transform_points
+from geomoe3d.geometry.se3 import motions_apart
 from geomoe3d.threads import each
 from geomoe3d.types import FloatArray, Hypothesis, IntArray, PreparedCloud
 
@@ -28,6 +28,7 @@ _LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less t
 _VIOLATION_WEIGHT = 10.0  # a tenth of the visible points in free space divides the score by e
 _VERDICT_WEIGHT = 0.5
 _MOST_VERDICT = 8.0
+_MOST_TURN_DEG = 15.0
 _VISIBLE_FLOOR = 0.05  # fewer visible points than this share make the violation rate unreliable
 
 
@@ -194,11 +195,11 @@ def distinct(
 ) -> list[Hypothesis]:
     """The best hypotheses that are all different motions, at most ``limit``; see `clearly_different`."""
     chosen: list[Hypothesis] = []
-    for hypothesis, evidence in ranked:
+    for hypothesis, _ in ranked:
         if len(chosen) == limit:
             break
-        entry = [(hypothesis, evidence)]
-        if all(clearly_different(entry, c.T_target_source, source, max_shift) for c in chosen):
+        T = hypothesis.T_target_source
+        if all(are_different(c.T_target_source, T, source, max_shift) for c in chosen):
             chosen.append(hypothesis)
     return chosen
 
@@ -208,22 +209,27 @@ def clearly_different(
     T_target_source: FloatArray,
     source: PreparedCloud,
     max_shift: float,
-    max_turn_deg: float = 15.0,
 ) -> tuple[Hypothesis, Evidence] | None:
-    """The first hypothesis that is another motion than the given one, or None.
+    """The first hypothesis that is another motion than the given one, or None; see `are_different`.
 
     Args:
         ranked: candidates, best first.
         T_target_source: (4, 4) the motion to differ from.
-        source: its centroid is where shifts are measured.
-        max_shift: motions closer than this, cloud units, and closer than ``max_turn_deg`` are the same.
+        source, max_shift: as in `are_different`.
     """
-    centre = source.points.mean(0)[None]
-    place = transform_points(T_target_source, centre)
     for hypothesis, evidence in ranked:
-        T = hypothesis.T_target_source
-        shift = float(np.linalg.norm(transform_points(T, centre) - place))
-        turn = rotation_angle_deg(T_target_source[:3, :3].T @ T[:3, :3])
-        if shift > max_shift or turn > max_turn_deg:
+        if are_different(T_target_source, hypothesis.T_target_source, source, max_shift):
             return hypothesis, evidence
     return None
+
+
+def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_shift: float) -> bool:
+    """Whether two motions (4, 4) are clearly different.
+
+    Args:
+        T_a, T_b: target from source.
+        source: its centroid is where shifts are measured.
+        max_shift: motions closer than this, cloud units, and closer than 15 degrees are the same.
+    """
+    shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
+    return shift > max_shift or turn > _MOST_TURN_DEG

@@ -14,6 +14,14 @@ if TYPE_CHECKING:
     from geomoe3d.data.check import CheckReport
     from geomoe3d.types import FloatArray
 
+_min_overlap = click.option(
+    "--min-overlap",
+    default=0.1,
+    show_default=True,
+    type=click.FloatRange(0, 1),
+    help="Least overlap of a pair that is listed.",
+)
+
 
 @click.group(context_settings=HELP)
 def command() -> None:
@@ -70,13 +78,7 @@ def _print(report: CheckReport) -> None:
     "--whole", is_flag=True, help="Keep what lies outside the cube of 3 m to which 3DMatch cut its fragments."
 )
 @click.option("--grid", type=float, help="Keep one point per cell of this edge, metres (default: all).")
-@click.option(
-    "--min-overlap",
-    default=0.1,
-    show_default=True,
-    type=click.FloatRange(0, 1),
-    help="Least overlap of a pair in gt.log.",
-)
+@_min_overlap
 @click.option("--convention", type=click.Choice(("7scenes", "tum", "plain")), help="Default: look at FRAMES.")
 @click.option("--intrinsics", metavar="FX,FY,CX,CY", help="Pixels (default: the folder's file).")
 @click.option("--depth-unit", type=float, help="Depth values per metre (default: 1000, TUM 5000).")
@@ -229,13 +231,7 @@ def synthesize(
     type=click.Choice(("train", "validation", "test")),
     help="Take the scenes of a published split of 3DMatch alone (default: all scenes).",
 )
-@click.option(
-    "--min-overlap",
-    default=0.1,
-    show_default=True,
-    type=click.FloatRange(0, 1),
-    help="Least overlap of a pair.",
-)
+@_min_overlap
 @click.option(
     "--voxel-size",
     default=0.05,

@@ -43,3 +43,10 @@ def describe(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
 def flip_normals(cloud: PreparedCloud, config: PreparationConfig) -> PreparedCloud:
     """The cloud as if its sensor had stood on the other side of every surface: described anew, no sensor."""
     return describe(replace(cloud, normals=-cloud.normals, viewpoint=None), config)
+
+
+def flip_pair(
+    described: tuple[PreparedCloud, PreparedCloud], config: PreparationConfig
+) -> tuple[PreparedCloud, PreparedCloud]:
+    """Both clouds with the normals of the first turned over, and without sensors."""
+    return flip_normals(described[0], config), replace(described[1], viewpoint=None)

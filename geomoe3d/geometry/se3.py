@@ -64,6 +64,12 @@ def translation_error(T_estimate: FloatArray, T_truth: FloatArray) -> float:
     return float(np.linalg.norm(T_estimate[:3, 3] - T_truth[:3, 3]))
 
 
+def motions_apart(T_a: FloatArray, T_b: FloatArray, place: FloatArray) -> tuple[float, float]:
+    """Distance between the two images of a place (3,), and the angle between the two rotations, degrees."""
+    a, b = transform_points(T_a, place[None]), transform_points(T_b, place[None])
+    return float(np.linalg.norm(b - a)), rotation_angle_deg(T_a[:3, :3].T @ T_b[:3, :3])
+
+
 def project_to_so3(R: FloatArray) -> FloatArray:
     """The rotation nearest to a 3x3 matrix in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(R)

@@ -1,4 +1,4 @@
-"""Many pairs: the table, the folder that survives kills, workers that die, the command and its page."""
+"""Many pairs: the folder that survives kills, what is its own, the command and its page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dying_tasks import die_always
 from small_scans import SETTINGS, cut, scene
 
 from geomoe3d import register_pairs
@@ -22,7 +22,7 @@ from geomoe3d.batch.folder import JOURNAL_FILE, RESULTS_FILE
 from geomoe3d.batch.memory import choose_workers, worker_bytes
 from geomoe3d.batch.run import BatchReport
 from geomoe3d.batch.store import Outcome
-from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
+from geomoe3d.batch.table import MATRIX_COLUMNS, read_pairs
 from geomoe3d.cli.batch import table as summary
 from geomoe3d.config import load_config
 from geomoe3d.errors import (
@@ -37,7 +37,6 @@ from geomoe3d.geometry.se3 import inverse
 from geomoe3d.journal import read_journal
 from geomoe3d.registration import Registrar
 from geomoe3d.transform_files import load_transform, save_transform
-from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 CONFIG = load_config(None, SETTINGS)
 OPTIONS = [part for setting in SETTINGS for part in ("--set", setting)]
@@ -90,60 +89,7 @@ def run_cli(*arguments, check=None, **named):
     return done
 
 
-# ---- the table --------------------------------------------------------------------------------------
-
-
-def test_paths_are_relative_to_the_table_and_ids_are_made_where_missing(tmp_path):
-    (tmp_path / "t.csv").write_text("target;source\nsub/b.ply;/x/a.ply\n\n")
-    (row,) = read_pairs(tmp_path / "t.csv")
-    assert row.source == "/x/a.ply"
-    assert row.target == str(tmp_path / "sub" / "b.ply")
-    assert row.id == "/x/a.ply+sub/b.ply"
-    assert row.initial is None
-
-
-@pytest.mark.parametrize(
-    ("text", "kind", "message"),
-    [
-        ("", InputError, "is empty"),
-        ("source,target\n", InputError, "holds no pairs"),
-        ("sorce,target\na,b\n", FormatError, "no column 'source'.*is 'sorce' meant"),
-        ("a.ply,b.ply\n", FormatError, "no column 'source'"),
-        ("source,source,target\na,b,c\n", FormatError, "more than one column 'source'"),
-        ("id,source,target\nx,a,b\nx,a,c\n", InputError, "line 3: the id 'x' is that of .* line 2"),
-        ("source,target\na,b\na,b\n", InputError, "line 3: the id"),
-        ("source,target\na,\n", InputError, "line 2: the cell 'target' is empty"),
-        ("source,target,T00\na,b,1\n", FormatError, "T00 but not T01"),
-        ("source,target,initial\na,b,none.txt\n", InputError, "line 2: the first guess.*none.txt"),
-        ("source,target,initial," + ",".join(MATRIX_COLUMNS) + "\n", FormatError, "both the column"),
-        ("source,target," + ",".join(MATRIX_COLUMNS) + "\na,b" + ",2" * 16 + "\n", InputError, "no rigid"),
-        ("source,target," + ",".join(MATRIX_COLUMNS) + "\na,b" + ",x" * 16 + "\n", InputError, "16 numbers"),
-        ("source,target,initail\na,b,g.txt\n", FormatError, "column 'initail', which is nearly 'initial'"),
-        ("Initial,source,target\ng.txt,a,b\n", FormatError, "column 'Initial', which is nearly 'initial'"),
-        ("source,target,T_00\na,b,1\n", FormatError, "column 'T_00', which is nearly 'T00'"),
-        ("source,target,ID\na,b,1\n", FormatError, "column 'ID', which is nearly 'id'"),
-        ("source,target,id,id\na,b,1,2\n", FormatError, "more than one column 'id'"),
-        ("source,target\na,b\na,1.ply,b\n", FormatError, "line 3 has more cells than the 2 .* 'b'; put"),
-    ],
-)
-def test_a_table_that_cannot_be_used_is_refused_with_its_line(tmp_path, text, kind, message):
-    path = tmp_path / "t.csv"
-    path.write_text(text)
-    with pytest.raises(kind, match=message):
-        read_pairs(path)
-
-
-def test_columns_unlike_any_known_one_and_empty_cells_beyond_the_last_are_ignored(tmp_path):
-    (tmp_path / "t.csv").write_text("source,target,source_id,note,ids,scene\na,b,1,c,2,d,,\n")
-    assert [row.id for row in read_pairs(tmp_path / "t.csv")] == ["a+b"]
-
-
-def test_tables_that_are_no_text_or_not_there(tmp_path):
-    with pytest.raises(InputError, match="cannot read"):
-        read_pairs(tmp_path / "none.csv")
-    (tmp_path / "t.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(FormatError, match="UTF-8"):
-        read_pairs(tmp_path / "t.csv")
+# ---- results ----------------------------------------------------------------------------------------
 
 
 def test_first_guesses_from_columns_and_from_files_are_the_same_motion(tmp_path, scans):
@@ -176,38 +122,6 @@ def test_a_transform_reads_back_bit_for_bit_from_every_format(tmp_path, finished
     for name, kind in (("none.txt", InputError), ("short.txt", FormatError), ("t.xml", FormatError)):
         with pytest.raises(kind):
             load_transform(tmp_path / name)
-
-
-def test_pairs_in_memory(tmp_path):
-    rows = as_rows([("a", "b"), (Path("a"), Path("c"), np.eye(4))])
-    assert [row.id for row in rows] == ["a+b", "a+c"]
-    assert rows[1].matrix.tolist() == np.eye(4).tolist()
-    assert [row.id for row in as_rows(np.array([("a", "b")]))] == ["a+b"]
-    for bad in ([], ["ab"], [("a",)], [("a", "b"), ("a", "b")]):
-        with pytest.raises(InputError):
-            as_rows(bad)
-
-
-@pytest.mark.parametrize(
-    ("pairs", "message"),
-    [
-        (None, "must be a CSV file or a list of .source, target.* found None"),
-        (np.zeros((5, 6)), r"list of .* found ndarray of shape \(5, 6\)"),
-        (7, "list of .* found int 7"),
-        ({"a": "b"}, "list of .* found dict of 1"),
-        ([None], "pair 1: expected .* found None"),
-        ([("a", "b"), {"a", "b"}], "pair 2: expected .* found set of 2"),
-        ([(np.zeros((9, 3)), "b")], r"pair 1: .* must be paths of files, found ndarray of shape \(9, 3\)"),
-        ([("a", None)], "pair 1: .* must be paths of files, found None"),
-    ],
-)
-def test_what_is_no_path_is_named(tmp_path, pairs, message):
-    with pytest.raises(InputError, match=message):
-        register_pairs(pairs, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-# ---- results ----------------------------------------------------------------------------------------
 
 
 def test_every_pair_has_its_answer_and_a_broken_file_fails_its_own_pair_alone(scans, finished):
@@ -419,62 +333,7 @@ def test_two_batches_in_one_folder_are_refused(scans, finished):
     assert (out / JOURNAL_FILE).read_bytes() == before
 
 
-# ---- workers that die --------------------------------------------------------------------------------
-
-
-def square(number):
-    return number * number
-
-
-def die_once(job):
-    """Kills its own process the first time that a number is tried."""
-    number, folder = job
-    mark = Path(folder) / str(number)
-    if number % 3 == 0 and not mark.exists():
-        mark.write_text("")
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-def die_always(number):
-    if number == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-def complain(number):
-    raise InputError(f"number {number}")
-
-
-def hungry(_):
-    return len(bytearray(3 << 30))
-
-
-def test_results_of_a_pool_that_loses_no_worker():
-    found = dict(run_surviving(SerialPool(), square, range(7)))
-    assert found == {k: k * k for k in range(7)}
-    assert list(run_surviving(SerialPool(), square, [])) == []
-    with pytest.raises(InputError, match="number 0"):
-        list(run_surviving(SerialPool(), complain, range(3)))
-
-
-def test_workers_that_are_killed_lose_nothing_and_repeat_no_result(tmp_path):
-    jobs = [(number, str(tmp_path)) for number in range(8)]
-    found = [made for _, made in run_surviving(ProcessPool(2), die_once, jobs)]
-    assert sorted(found) == list(range(8))
-    assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_an_item_that_kills_every_worker_is_given_up_alone():
-    found = dict(run_surviving(ProcessPool(2), die_always, range(5)))
-    assert isinstance(found.pop(2), WorkerDied)
-    assert found == {k: k for k in (0, 1, 3, 4)}
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory as Linux has them")
-def test_a_worker_is_held_to_its_memory():
-    with pytest.raises(MemoryError):
-        list(run_surviving(ProcessPool(1, memory_limit=1 << 30), hungry, [0]))
+# ---- memory -----------------------------------------------------------------------------------------
 
 
 def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):

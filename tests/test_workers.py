@@ -10,9 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
+from dying_tasks import die_always, die_once
 
 from geomoe3d.errors import InputError
-from geomoe3d.workers import Pool, ProcessPool, SerialPool, run_surviving
+from geomoe3d.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 
 def _square(number):
@@ -95,3 +96,45 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path):
     while any(worker.exists() for worker in workers):
         assert time.monotonic() < deadline, "workers outlive their parent"
         time.sleep(0.1)
+
+
+# ---- workers that die --------------------------------------------------------------------------------
+
+
+def square(number):
+    return number * number
+
+
+def complain(number):
+    raise InputError(f"number {number}")
+
+
+def hungry(_):
+    return len(bytearray(3 << 30))
+
+
+def test_results_of_a_pool_that_loses_no_worker():
+    found = dict(run_surviving(SerialPool(), square, range(7)))
+    assert found == {k: k * k for k in range(7)}
+    assert list(run_surviving(SerialPool(), square, [])) == []
+    with pytest.raises(InputError, match="number 0"):
+        list(run_surviving(SerialPool(), complain, range(3)))
+
+
+def test_workers_that_are_killed_lose_nothing_and_repeat_no_result(tmp_path):
+    jobs = [(number, str(tmp_path)) for number in range(8)]
+    found = [made for _, made in run_surviving(ProcessPool(2), die_once, jobs)]
+    assert sorted(found) == list(range(8))
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_item_that_kills_every_worker_is_given_up_alone():
+    found = dict(run_surviving(ProcessPool(2), die_always, range(5)))
+    assert isinstance(found.pop(2), WorkerDied)
+    assert found == {k: k for k in (0, 1, 3, 4)}
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory as Linux has them")
+def test_a_worker_is_held_to_its_memory():
+    with pytest.raises(MemoryError):
+        list(run_surviving(ProcessPool(1, memory_limit=1 << 30), hungry, [0]))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from geomoe3d.batch.run import register_pairs
     from geomoe3d.clouds.io import load_points, save_points
     from geomoe3d.config import RegistrationConfig, load_config
-    from geomoe3d.correspondence_solver import CorrespondenceResult, register_correspondences
+    from geomoe3d.correspondence_registration import CorrespondenceResult, register_correspondences
     from geomoe3d.errors import (
         CheckpointError,
         ConfigError,
@@ -66,8 +66,8 @@ __all__ = [
 _HOME = {
     "Registrar": "registration",
     "register": "registration",
-    "register_correspondences": "correspondence_solver",
-    "CorrespondenceResult": "correspondence_solver",
+    "register_correspondences": "correspondence_registration",
+    "CorrespondenceResult": "correspondence_registration",
     "register_pairs": "batch.run",
     "register_scans": "multiway.run",
     "RegistrationResult": "result",

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from geomoe3d.machine import Machine
+from geomoe3d.runtime.machine import Machine
 
 State = Literal["ok", "missing", "broken"]
 

@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.answer import Findings, failed_result, finished_result
-from geomoe3d.choice import Chooser
-from geomoe3d.clouds.description_cache import DescriptionCache
-from geomoe3d.clouds.features import describe, flip_pair
 from geomoe3d.clouds.io import load_points
-from geomoe3d.clouds.matching import match
 from geomoe3d.clouds.prepare import (
     bounded_voxel_size,
     check_cloud,
@@ -28,16 +23,21 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.correspondence_solver import check_length, check_rows, localised
+from geomoe3d.correspondence_registration import check_length, check_rows, localised
+from geomoe3d.decision.answer import Findings, failed_result, finished_result
+from geomoe3d.decision.confidence import Judgement
+from geomoe3d.decision.remarks import remarks
+from geomoe3d.decision.selection import Chooser
 from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.estimators.base import Estimator, make_estimator
 from geomoe3d.estimators.proposals import solve
+from geomoe3d.features.cache import DescriptionCache
+from geomoe3d.features.fpfh import describe, flip_pair
 from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
-from geomoe3d.judge import Judgement
-from geomoe3d.remarks import remarks
+from geomoe3d.matching.nearest import match
 from geomoe3d.result import RegistrationResult
-from geomoe3d.stages import Progress, StageClock
-from geomoe3d.threads import single_blas_thread
+from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 if TYPE_CHECKING:

@@ -70,9 +70,9 @@ class RegistrationResult:
         confidence: in [0, 1]; see docs/concepts.md for what it is made of.
         overlap: share of source voxel points (1,500 of them at most) with a target point within the inlier
             threshold.
-        evidence: what the clouds say of the answer, see `geomoe3d.verification.Evidence`, and
-            ``observability`` and ``looseness``, see `geomoe3d.judge.Information`; empty where nothing was
-            estimated.
+        evidence: what the clouds say of the answer, see `geomoe3d.scoring.surfaces.Evidence`, and
+            ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; empty where
+            nothing was estimated.
         num_correspondences: correspondences given to the estimator.
         num_inliers: of these, how many agree with the transform.
         inlier_threshold: residual limit of an inlier, cloud units.

@@ -21,7 +21,7 @@ from geomoe3d.evaluation.predict import MethodSpec, predict
 from geomoe3d.evaluation.report_markdown import benchmark_tables
 from geomoe3d.evaluation.study import score_study, write_report
 from geomoe3d.evaluation.task import Task
-from geomoe3d.files import write_text
+from geomoe3d.runtime.files import write_text
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 ESTIMATORS = ("geomoe", "geomoe-svd", "consensus", "spectral", "open3d-ransac-50k", "open3d-fgr", "gc-ransac")

@@ -8,8 +8,8 @@ recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix t
 different scenes. Every pair is registered twice, without a second look and always with one, since the
 confidence decides about it; the outcomes go to OUT, and what is there is not done again: give another OUT for
 other weights or code. Prints
-coefficients for `geomoe3d/judge.py`, cross-validated over scenes. Needs scikit-learn, which the package
-itself does not.
+coefficients for `geomoe3d/decision/confidence.py`, cross-validated over scenes. Needs scikit-learn, which the
+package itself does not.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ import numpy as np
 
 from geomoe3d.config import load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
+from geomoe3d.decision.confidence import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, Information, confidence_inputs
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.evaluation.measures import is_right, motion_errors
-from geomoe3d.judge import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, Information, confidence_inputs
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
-from geomoe3d.verification import Evidence
+from geomoe3d.scoring.surfaces import Evidence
 
 BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 """Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""

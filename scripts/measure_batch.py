@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from geomoe3d.geometry.se3 import project_to_so3
-from geomoe3d.journal import read_journal
-from geomoe3d.provenance import hardware
+from geomoe3d.runtime.journal import read_journal
+from geomoe3d.runtime.provenance import hardware
 from geomoe3d.types import FloatArray
 
 _SETTINGS = ("voxel_size=0.12", "preparation.viewpoint=centroid", "matching.max_correspondences=400")

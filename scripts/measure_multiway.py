@@ -34,14 +34,14 @@ from geomoe3d.geometry.se3 import (
     transform_points,
     translation_error,
 )
-from geomoe3d.journal import read_journal
 from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.model import SceneGroup, SceneModel
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.run import MOST_ROUNDS, register_scans
 from geomoe3d.multiway.scans import choose_common_voxel_size, find_scans
 from geomoe3d.registration import Registrar
-from geomoe3d.stages import StageClock
+from geomoe3d.runtime.journal import read_journal
+from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray
 
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])

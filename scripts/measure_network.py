@@ -22,11 +22,11 @@ from pathlib import Path
 
 import torch
 
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.counting import count_cost, num_parameters
-from geomoe3d.filters.folded import FoldedGeoMoE
-from geomoe3d.filters.geomoe import GeoMoE, find_neighbors
-from geomoe3d.filters.inputs import pair_input
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.counting import count_cost, num_parameters
+from geomoe3d.networks.folded import FoldedGeoMoE
+from geomoe3d.networks.geomoe import GeoMoE, find_neighbors
+from geomoe3d.networks.inputs import pair_input
 
 SIZES = (250, 500, 1000, 2000, 5000, 10_000, 20_000)
 SQUARE = 2048

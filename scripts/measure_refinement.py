@@ -19,7 +19,7 @@ from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import PreparationConfig, RefinementConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, shift_frames, transform_points
-from geomoe3d.refine import refine
+from geomoe3d.refinement.icp import refine
 
 VOXEL_SIZE = 0.05
 

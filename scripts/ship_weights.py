@@ -3,8 +3,8 @@
     python scripts/ship_weights.py runs/motions [--last] [--out FILE]
 
 Reads best.pt, or the averaged weights of last.pt, of the run folder and its config.yaml, and writes
-geomoe3d/filters/weights/geomoe3d.safetensors and its card, or, to compare before shipping, FILE. Says how far
-the verdicts move by the rounding.
+geomoe3d/networks/weights/geomoe3d.safetensors and its card, or, to compare before shipping, FILE. Says how
+far the verdicts move by the rounding.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 
 import torch
 
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.pretrained import WeightCard, load_pretrained, save_pretrained
-from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, PACKAGED
-from geomoe3d.provenance import source_commit
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, PACKAGED
+from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.checkpoint import load_checkpoint
 from geomoe3d.training.config import load_train_config
 from geomoe3d.training.logs import read_csv

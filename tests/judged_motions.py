@@ -10,11 +10,11 @@ from corner_scenes import AT_ZERO, VOXEL, scene
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.config import build_config
-from geomoe3d.filters.aligned import CHANNELS, AlignedChannels
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.inputs import MotionInputs, collate
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.networks.aligned import CHANNELS, AlignedChannels
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.inputs import MotionInputs, collate
 from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import FloatArray
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from surface_pairs import motion
 
-from geomoe3d.answer import Findings
+from geomoe3d.decision.answer import Findings
 from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.scoring.surfaces import Evidence
 from geomoe3d.types import Correspondences
-from geomoe3d.verification import Evidence
 
 
 def test_nothing_found_holds_no_transform() -> None:

@@ -24,6 +24,7 @@ from geomoe3d.batch.run import BatchReport
 from geomoe3d.batch.store import Outcome
 from geomoe3d.batch.table import MATRIX_COLUMNS, read_pairs
 from geomoe3d.cli.batch import table as summary
+from geomoe3d.clouds.transform_files import load_transform, save_transform
 from geomoe3d.config import load_config
 from geomoe3d.errors import (
     CheckpointError,
@@ -34,9 +35,8 @@ from geomoe3d.errors import (
     OutputError,
 )
 from geomoe3d.geometry.se3 import inverse
-from geomoe3d.journal import read_journal
 from geomoe3d.registration import Registrar
-from geomoe3d.transform_files import load_transform, save_transform
+from geomoe3d.runtime.journal import read_journal
 
 CONFIG = load_config(None, SETTINGS)
 OPTIONS = [part for setting in SETTINGS for part in ("--set", setting)]
@@ -232,13 +232,13 @@ def copied(finished, tmp_path):
 def test_what_is_refused_is_before_anything_is_removed_or_written(
     scans, copied, monkeypatch, new, named, kind, message
 ):
-    import geomoe3d.workers as workers
+    import geomoe3d.runtime.workers as workers
 
     def absent(name):
         raise ImportError(name)
 
     monkeypatch.setattr(workers, "import_module", absent)
-    monkeypatch.setattr("geomoe3d.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
+    monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
     folder = copied.with_name("new") if new else copied
     before = everything(folder)
     named = {**named, "config": load_config(None, [*SETTINGS, *named.get("config", [])])}
@@ -324,7 +324,7 @@ def test_an_id_too_long_for_a_file_name_is_refused_before_work(scans, tmp_path):
 
 def test_two_batches_in_one_folder_are_refused(scans, finished):
     _, out = finished
-    from geomoe3d.journal import Journal
+    from geomoe3d.runtime.journal import Journal
 
     before = (out / JOURNAL_FILE).read_bytes()
     for fresh in (False, True):  # beginning anew must not pull the journal from under the other's feet
@@ -340,7 +340,7 @@ def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):
     rows = read_pairs(scans[0] / "pairs.csv")
     each = worker_bytes(rows)
     assert 2**28 < each < 2**30
-    monkeypatch.setattr("geomoe3d.machine.Machine.memory", lambda self: (3 * each, 4 * each))
+    monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (3 * each, 4 * each))
     assert choose_workers(2, each) == (2, int(0.9 * 3 * each) // 2)
     with pytest.raises(InputError, match=r"at most --workers 2"):
         choose_workers(3, each)
@@ -420,7 +420,7 @@ def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_pa
 
 
 def test_without_dask_a_scheduler_says_what_to_install(scans, tmp_path, monkeypatch):
-    import geomoe3d.workers as workers
+    import geomoe3d.runtime.workers as workers
 
     def absent(name):
         raise ImportError(name)

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.choice import Chooser
-from geomoe3d.clouds.features import describe
-from geomoe3d.clouds.matching import match
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision.selection import Chooser
 from geomoe3d.errors import ConfigError, EmptyCloudError
+from geomoe3d.features.fpfh import describe
 from geomoe3d.filters.base import FilterOutput
 from geomoe3d.filters.motion_judge import Judged
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg
+from geomoe3d.matching.nearest import match
 from geomoe3d.registration import Registrar
-from geomoe3d.stages import StageClock
-from geomoe3d.threads import single_blas_thread
+from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.surfaces import Evidence, distinct
 from geomoe3d.types import Hypothesis
-from geomoe3d.verification import Evidence, distinct
 
 VOXEL = 0.05
 

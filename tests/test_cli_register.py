@@ -228,7 +228,7 @@ def test_an_input_is_never_an_output_nor_two_outputs_one_file(tmp_path, scan_fil
 def test_the_answer_is_printed_even_if_it_cannot_be_written(
     tmp_path, scan_files, fake_registrar, monkeypatch, capsys
 ):
-    import geomoe3d.transform_files as transform_files
+    import geomoe3d.clouds.transform_files as transform_files
 
     def full(*arguments, **options):
         raise OutputError("no space left")

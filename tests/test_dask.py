@@ -19,8 +19,8 @@ from geomoe3d import register_pairs
 from geomoe3d.batch.folder import JOURNAL_FILE, RESULTS_FILE
 from geomoe3d.config import load_config
 from geomoe3d.errors import DependencyError, InputError
-from geomoe3d.journal import read_journal
-from geomoe3d.workers import DaskPool
+from geomoe3d.runtime.journal import read_journal
+from geomoe3d.runtime.workers import DaskPool
 
 pytest.importorskip("distributed", reason="Dask is not installed: pip install dask distributed")
 

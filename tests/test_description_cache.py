@@ -11,14 +11,14 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-import geomoe3d.clouds.description_cache as module
-from geomoe3d.clouds.description_cache import DescriptionCache
-from geomoe3d.clouds.features import describe
+import geomoe3d.features.cache as module
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import EmptyCloudError, InputError, OutputError
+from geomoe3d.features.cache import DescriptionCache
+from geomoe3d.features.fpfh import describe
 from geomoe3d.registration import Registrar
 
 CONFIG = PreparationConfig()

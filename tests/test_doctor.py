@@ -14,7 +14,7 @@ import pytest
 from geomoe3d import doctor
 from geomoe3d.cli.errors import run
 from geomoe3d.cli.main import geomoe3d
-from geomoe3d.machine import ImportOutcome, Machine
+from geomoe3d.runtime.machine import ImportOutcome, Machine
 
 ROOT = Path(__file__).parents[1]
 

@@ -157,9 +157,9 @@ def test_hopeless_clouds_have_no_motion():
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     torch = pytest.importorskip("torch")
-    from geomoe3d.filters.architecture import NetworkConfig
-    from geomoe3d.filters.geomoe import GeoMoE
-    from geomoe3d.filters.pretrained import WeightCard, save_pretrained
+    from geomoe3d.networks.architecture import NetworkConfig
+    from geomoe3d.networks.geomoe import GeoMoE
+    from geomoe3d.networks.pretrained import WeightCard, save_pretrained
 
     made = {}
     for name, channels in (("plain", ()), ("other", ()), ("matching", ("ratio",))):

@@ -27,7 +27,7 @@ from geomoe3d.evaluation.store import encode, find_runs, read_info, read_predict
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.evaluation.task import Task, load_run_pairs
 from geomoe3d.evaluation.tracks import InputMaker
-from geomoe3d.journal import Journal
+from geomoe3d.runtime.journal import Journal
 
 # ---- one pair ---------------------------------------------------------------------------------------
 

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from surface_pairs import corner
 
-from geomoe3d.clouds.features import describe, flip_normals
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
+from geomoe3d.features.fpfh import describe, flip_normals
 from geomoe3d.types import PointCloud
 
 CONFIG = PreparationConfig(viewpoint="centroid")  # a guess costs time and is tested by itself

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from geomoe3d.errors import OutputError
-from geomoe3d.files import check_output, write_atomically, write_text
+from geomoe3d.runtime.files import check_output, write_atomically, write_text
 
 
 def names(folder: Path) -> list[str]:

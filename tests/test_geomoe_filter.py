@@ -14,11 +14,11 @@ import torch
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, InputError, OutputError
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.geomoe_filter import GeoMoEFilter, geomoe_filter
-from geomoe3d.filters.inputs import collate, pair_input
-from geomoe3d.filters.pretrained import WeightCard, load_pretrained, read_card, save_pretrained
+from geomoe3d.filters.network import GeoMoEFilter, geomoe_filter
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.inputs import collate, pair_input
+from geomoe3d.networks.pretrained import WeightCard, load_pretrained, read_card, save_pretrained
 from geomoe3d.training.synthetic import SyntheticConfig, SyntheticPairs
 from geomoe3d.types import Correspondences
 
@@ -183,8 +183,8 @@ def test_pickled_files_are_not_read(tmp_path: Path) -> None:
 def test_using_a_filter_imports_no_training_and_no_compiler() -> None:
     code = (
         "import sys, numpy as np\n"
-        "from geomoe3d.filters.geomoe import GeoMoE\n"
-        "from geomoe3d.filters.geomoe_filter import GeoMoEFilter\n"
+        "from geomoe3d.networks.geomoe import GeoMoE\n"
+        "from geomoe3d.filters.network import GeoMoEFilter\n"
         "from geomoe3d.types import Correspondences\n"
         "points = Correspondences(np.random.default_rng(0).normal(size=(50, 6)))\n"
         "GeoMoEFilter(GeoMoE())(points, voxel_size=0.1)\n"

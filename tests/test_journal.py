@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from geomoe3d.errors import FormatError, InputError, OutputError
-from geomoe3d.journal import Journal, read_journal
+from geomoe3d.runtime.journal import Journal, read_journal
 
 
 def test_records_come_back_in_order(tmp_path):
@@ -87,7 +87,7 @@ def test_a_folder_is_no_journal(tmp_path):
 def test_what_was_appended_survives_sigkill(tmp_path):
     path = tmp_path / "a.jsonl"
     code = (
-        "import sys, time\nfrom geomoe3d.journal import Journal\n"
+        "import sys, time\nfrom geomoe3d.runtime.journal import Journal\n"
         f"journal = Journal({str(path)!r})\n"
         "for k in range(10**9):\n    journal.append({'k': k, 'x': 'y' * 300}); print(k, flush=True)\n"
     )

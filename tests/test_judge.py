@@ -14,9 +14,9 @@ from surface_pairs import VOXEL, motion, pair, perturbation, prepared, surfaces
 import geomoe3d
 from geomoe3d.config import JudgementConfig
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision.confidence import Information, confidence_score, judge, lead_over, measure_information
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
-from geomoe3d.judge import Information, confidence_score, judge, lead_over, measure_information
-from geomoe3d.verification import Evidence
+from geomoe3d.scoring.surfaces import Evidence
 
 # ---- the information of a fit ---------------------------------------------------------------------------
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.geomoe import GeoMoEOutput
-from geomoe3d.filters.inputs import pair_input
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.geomoe import GeoMoEOutput
+from geomoe3d.networks.inputs import pair_input
 from geomoe3d.training.losses import (
     LossConfig,
     classification_loss,

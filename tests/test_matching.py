@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geomoe3d.clouds import matching
-from geomoe3d.clouds.matching import match, nearest_features
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
+from geomoe3d.matching.nearest import match, nearest_features
 from geomoe3d.types import PreparedCloud
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -243,7 +243,7 @@ def test_the_limit_applies_after_the_method(method: str) -> None:
 THREADS_SCRIPT = """
 import sys
 import numpy as np
-from geomoe3d.clouds.matching import nearest_features
+from geomoe3d.matching.nearest import nearest_features
 rng = np.random.default_rng(0)
 a, b = (np.abs(rng.normal(size=(k, 33))).astype(np.float32) for k in (3000, 2500))
 a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))

@@ -14,13 +14,13 @@ from judged_motions import network, turned
 from geomoe3d.config import EstimatorConfig, build_config
 from geomoe3d.errors import CheckpointError
 from geomoe3d.estimators.consensus import ConsensusEstimator
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.folded import FoldedGeoMoE
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.geomoe_filter import GeoMoEFilter
-from geomoe3d.filters.inputs import MotionInputs, collate
 from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
+from geomoe3d.filters.network import GeoMoEFilter
 from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.folded import FoldedGeoMoE
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.inputs import MotionInputs, collate
 from geomoe3d.types import Correspondences, Hypothesis
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -25,12 +25,12 @@ from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.config import load_config
 from geomoe3d.errors import ConfigError, DependencyError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse, make_transform, rotation_error_deg, transform_points
-from geomoe3d.journal import read_journal
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.grouping import GroupingRules
 from geomoe3d.multiway.page import render_model_page
 from geomoe3d.multiway.report import _why_unplaced
 from geomoe3d.multiway.scans import Scan
+from geomoe3d.runtime.journal import read_journal
 
 CONFIG = load_config(None, SETTINGS)
 
@@ -273,8 +273,8 @@ def test_what_is_refused_is_before_anything_is_removed(
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr("geomoe3d.workers.import_module", absent)
-    monkeypatch.setattr("geomoe3d.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
+    monkeypatch.setattr("geomoe3d.runtime.workers.import_module", absent)
+    monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
     named = {"config": CONFIG, **named}
     scans = [scanned_room[0] / name for name in named.pop("scans", ["scan_0.npy", "scan_1.npy"])]
     before = everything(copied)

@@ -8,8 +8,8 @@ from tiny_networks import TINY, sample, settle, tiny
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.geomoe import GeoMoE, find_neighbors
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.geomoe import GeoMoE, find_neighbors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geomoe3d.filters.blocks import GraphAttention, SubFieldPool
-from geomoe3d.filters.layers import weights_from_logits
+from geomoe3d.networks.blocks import GraphAttention, SubFieldPool
+from geomoe3d.networks.layers import weights_from_logits
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from tiny_networks import tiny
 
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.counting import count_cost, num_parameters
-from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.counting import count_cost, num_parameters
+from geomoe3d.networks.geomoe import GeoMoE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from geomoe3d.config import build_config
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.folded import FoldedGeoMoE
-from geomoe3d.filters.geomoe import GeoMoE, find_neighbors
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.folded import FoldedGeoMoE
+from geomoe3d.networks.geomoe import GeoMoE, find_neighbors
 
 SMALL = {"num_layers": 3, "width": 32, "num_sub_fields": 10, "num_heads": 4, "expert_width": 6}
 SWITCHES: list[dict[str, object]] = [

@@ -12,10 +12,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError, InputError, NonFiniteError
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.compatibility import compatibility_inputs
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.inputs import BatchInput, PairInput, collate, pair_input
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.compatibility import compatibility_inputs
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.inputs import BatchInput, PairInput, collate, pair_input
 
 FAITHFUL = NetworkConfig()
 STRONGER = NetworkConfig(extra_channels=("compatibility", "hypothesis"), knn_space="compatibility")
@@ -126,8 +126,8 @@ def test_channels_equal_their_definition_written_plainly() -> None:
 
 
 def test_hypothesis_channels_equal_residuals_counted_plainly() -> None:
-    from geomoe3d.filters.compatibility import hypothesis_channels
     from geomoe3d.geometry.kabsch import weighted_kabsch
+    from geomoe3d.networks.compatibility import hypothesis_channels
 
     points, _ = scene(50, 25)
     x = torch.tensor(points / 0.05).float()

@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from geomoe3d.filters.moe import FMoE
+from geomoe3d.networks.moe import FMoE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

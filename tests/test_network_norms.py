@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geomoe3d.filters.norms import BatchNorm, ContextNorm, Pointwise, frozen_statistics, norm_relu_linear
+from geomoe3d.networks.norms import BatchNorm, ContextNorm, Pointwise, frozen_statistics, norm_relu_linear
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

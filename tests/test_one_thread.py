@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from geomoe3d.filters.one_thread import single_torch_thread
+from geomoe3d.networks.one_thread import single_torch_thread
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from surface_pairs import corner
 
-from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.prepare import (
     bounded_voxel_size,
     check_cloud,
@@ -28,6 +27,7 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
+from geomoe3d.features.fpfh import describe
 from geomoe3d.types import PointCloud
 
 CONFIG = PreparationConfig(viewpoint="centroid")  # a guess costs time and is tested by itself

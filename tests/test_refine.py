@@ -10,7 +10,7 @@ from surface_pairs import VOXEL, motion, pair, perturbation, prepared, surfaces
 
 from geomoe3d.config import RefinementConfig
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points, translation_error
-from geomoe3d.refine import refine
+from geomoe3d.refinement.icp import refine
 from geomoe3d.types import PreparedCloud
 
 METHODS = ["icp", "gicp"]

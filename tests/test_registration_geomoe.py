@@ -9,9 +9,9 @@ from geomoe3d.cli.errors import run
 from geomoe3d.cli.register import command
 from geomoe3d.data.sample import make_sample_pair, write_sample_pair
 from geomoe3d.errors import CheckpointError
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.pretrained import WeightCard, save_pretrained
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.pretrained import WeightCard, save_pretrained
 from geomoe3d.registration import Registrar
 
 

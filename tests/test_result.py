@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.answer import failed_result
 from geomoe3d.config import RegistrationConfig
+from geomoe3d.decision.answer import failed_result
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 from geomoe3d.result import Alternative, CloudReport, RegistrationResult

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.clouds.matching import match
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import EstimatorConfig, MatchingConfig
 from geomoe3d.errors import InputError
@@ -16,6 +15,7 @@ from geomoe3d.estimators.consensus import ConsensusEstimator, compatibility, sco
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
+from geomoe3d.matching.nearest import match
 from geomoe3d.training import motions
 from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import Correspondences, PreparedCloud

@@ -11,8 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from geomoe3d import threads
-from geomoe3d.threads import each, usable_threads
+from geomoe3d.runtime import threads
+from geomoe3d.runtime.threads import each, usable_threads
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_many_callers_share_the_helpers(three_threads):
 def test_a_thread_that_outlives_the_main_one_does_its_work_alone():
     code = """
 import threading, time
-from geomoe3d.threads import each
+from geomoe3d.runtime.threads import each
 def late():
     time.sleep(0.5)
     print(each(lambda x: x + 1, range(4)))

@@ -70,8 +70,8 @@ def test_density_of_the_source_points_does_not_give_the_true_ones_away() -> None
 
 
 def test_structured_outliers_agree_on_another_motion() -> None:
-    from geomoe3d.filters.architecture import NetworkConfig
-    from geomoe3d.filters.inputs import pair_input
+    from geomoe3d.networks.architecture import NetworkConfig
+    from geomoe3d.networks.inputs import pair_input
 
     network = NetworkConfig(extra_channels=("compatibility", "hypothesis"), knn_space="compatibility")
 

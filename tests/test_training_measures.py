@@ -28,7 +28,7 @@ def test_measures_by_hand() -> None:
 
 
 def test_motion_is_found_by_true_weights_and_not_by_none() -> None:
-    from geomoe3d.filters.architecture import NetworkConfig
+    from geomoe3d.networks.architecture import NetworkConfig
 
     network = NetworkConfig()
     config = SyntheticConfig(inlier_ratio=(0.2, 0.5), noise=(0.1, 0.2))

@@ -17,8 +17,8 @@ from geomoe3d.config import build_config
 from geomoe3d.data.shards import DescribedScene
 from geomoe3d.data.shards import write_shard as write_described
 from geomoe3d.errors import ConfigError, FormatError, InputError, OutputError
-from geomoe3d.filters.geomoe import GeoMoE
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
+from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.training import motions as motions_module
 from geomoe3d.training.batches import choose_motions, make_batch, make_sample
 from geomoe3d.training.config import TrainConfig, load_train_config

@@ -59,7 +59,7 @@ from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.distributed import join, leave
 from geomoe3d.training.batches import open_training, training_loader
 from geomoe3d.training.step import Updater
-from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.networks.geomoe import GeoMoE
 import json
 tree = json.loads(sys.argv[1])
 config = build_config(TrainConfig, tree)

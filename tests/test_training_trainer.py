@@ -12,7 +12,7 @@ import torch
 from training_runs import TREE, Silent, assert_same_run, config_of
 
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
-from geomoe3d.filters.pretrained import load_pretrained
+from geomoe3d.networks.pretrained import load_pretrained
 from geomoe3d.training.checkpoint import load_checkpoint, save_checkpoint
 from geomoe3d.training.logs import read_csv
 from geomoe3d.training.step import Updater

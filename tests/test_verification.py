@@ -9,16 +9,16 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import InputError
+from geomoe3d.features.fpfh import describe
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
+from geomoe3d.scoring.surfaces import Evidence, Verifier, clearly_different
 from geomoe3d.types import Hypothesis, PreparedCloud
-from geomoe3d.verification import Evidence, Verifier, clearly_different
 
 CONFIG = PreparationConfig()
 THRESHOLD = 0.1

@@ -13,7 +13,7 @@ import pytest
 from dying_tasks import die_always, die_once
 
 from geomoe3d.errors import InputError
-from geomoe3d.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
+from geomoe3d.runtime.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 
 def _square(number):
@@ -64,7 +64,7 @@ def test_no_workers_is_refused():
 
 _PARENT = """
 import os, sys, time
-from geomoe3d.workers import ProcessPool, run_surviving
+from geomoe3d.runtime.workers import ProcessPool, run_surviving
 sys.path.insert(0, sys.argv[1])
 from napping import nap
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from geomoe3d.config import build_config
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.geomoe import GeoMoE
 
 TINY = NetworkConfig(num_layers=2, width=16, num_sub_fields=6, num_heads=2, expert_width=4)
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.errors import FormatError, InputError, OutputError
-from geomoe3d.journal import Journal
 from geomoe3d.result import RegistrationResult
-from geomoe3d.transform_files import save_transform
+from geomoe3d.runtime.journal import Journal
 
 RUN_FILE, JOURNAL_FILE, RESULTS_FILE = "run.json", "journal.jsonl", "results.jsonl"
 PAGE_FILE, TRANSFORMS_FOLDER = "page.html", "transforms"

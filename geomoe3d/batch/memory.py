@@ -8,8 +8,8 @@ from pathlib import Path
 
 from geomoe3d.batch.table import PairRow
 from geomoe3d.errors import InputError
-from geomoe3d.machine import Machine
-from geomoe3d.provenance import usable_cores
+from geomoe3d.runtime.machine import Machine
+from geomoe3d.runtime.provenance import usable_cores
 
 _BASE_BYTES = 750 * 2**20  # libraries, torch among them, a block of the similarity matrix, described clouds
 _PER_FILE_BYTE = 5  # binary PLY of single floats: 12 bytes a point in the file, some 60 while it is thinned

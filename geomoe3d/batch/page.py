@@ -17,10 +17,10 @@ from geomoe3d.batch.folder import PAGE_MARK
 from geomoe3d.batch.store import Outcome
 from geomoe3d.batch.table import PairRow
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.errors import GeoMoE3DError
-from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.transform_files import has_transform
+from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.scene import STATUS_WORDS, thin
 from geomoe3d.visual.thumbnail import pair_thumbnail

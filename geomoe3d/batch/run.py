@@ -20,12 +20,12 @@ from geomoe3d.batch.memory import choose_workers, gibibytes, worker_bytes
 from geomoe3d.batch.store import BatchStore, Outcome
 from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
 from geomoe3d.batch.task import Settings, Task, as_record, make_ready, register_pair
-from geomoe3d.clouds.description_cache import CACHE_VARIABLE
+from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError, OutputError
+from geomoe3d.features.cache import CACHE_VARIABLE
 from geomoe3d.filters.base import resolved
-from geomoe3d.transform_files import has_transform
-from geomoe3d.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
+from geomoe3d.runtime.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 ALL_THAT_FIT = 0
 
@@ -96,7 +96,7 @@ class Labour:
             say: called with a sentence.
 
         Raises:
-            InputError, DependencyError: as the pools of `geomoe3d.workers` and `choose_workers`.
+            InputError, DependencyError: as the pools of `geomoe3d.runtime.workers` and `choose_workers`.
         """
         if self.scheduler is not None:
             pool = DaskPool(self.scheduler)

@@ -16,7 +16,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.answer import library_versions
 from geomoe3d.batch.folder import (
     FORMAT,
     JOURNAL_FILE,
@@ -28,12 +27,13 @@ from geomoe3d.batch.folder import (
     remove_batch,
 )
 from geomoe3d.config import RegistrationConfig
+from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import FormatError, InputError, OutputError
-from geomoe3d.files import write_atomically, write_text
-from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, find_weights
-from geomoe3d.journal import Journal, read_journal
-from geomoe3d.provenance import hardware, source_commit
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, find_weights
 from geomoe3d.result import RegistrationResult
+from geomoe3d.runtime.files import write_atomically, write_text
+from geomoe3d.runtime.journal import Journal, read_journal
+from geomoe3d.runtime.provenance import hardware, source_commit
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import check_motion
-from geomoe3d.transform_files import load_transform
 from geomoe3d.types import FloatArray
 
 MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from geomoe3d.answer import library_versions
 from geomoe3d.batch.table import PairRow
-from geomoe3d.clouds.description_cache import DescriptionCache, default_cache_folder
 from geomoe3d.config import RegistrationConfig, build_config
+from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import DependencyError, GeoMoE3DError, OutputError
+from geomoe3d.features.cache import DescriptionCache, default_cache_folder
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
 

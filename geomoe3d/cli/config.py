@@ -19,8 +19,8 @@ def command(source: str | None, assignments: tuple[str, ...], out: str | None, f
     Edit it and pass it on with `register --config FILE`; keys left out keep their defaults.
     """
     from geomoe3d.config import load_config
-    from geomoe3d.config_text import commented_yaml
-    from geomoe3d.files import write_text
+    from geomoe3d.runtime.config_text import commented_yaml
+    from geomoe3d.runtime.files import write_text
 
     text = commented_yaml(load_config(source, list(assignments)))
     if out is None:

@@ -125,7 +125,7 @@ def score(study: str, raw: bool, reports: tuple[str, ...], force: bool, quiet: b
     """Score the predictions in OUT: recall, errors, precision and recall of inliers, time, calibration."""
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.study import REPORT_SUFFIXES, write_report
-    from geomoe3d.files import check_output
+    from geomoe3d.runtime.files import check_output
 
     for report in reports:
         if Path(report).suffix not in REPORT_SUFFIXES:

@@ -99,8 +99,8 @@ def command(
 
     with stdout_to_stderr(), stage_display(quiet) as stage:
         stage("start")  # importing the libraries below takes a second
+        from geomoe3d.clouds.transform_files import load_transform
         from geomoe3d.registration import Registrar
-        from geomoe3d.transform_files import load_transform
 
         guess = None if initial is None else load_transform(initial)
         registrar = Registrar(config)
@@ -127,7 +127,7 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
     if as_json:
         click.echo(answer.to_json())
     elif quiet:
-        from geomoe3d.transform_files import has_transform, transform_text
+        from geomoe3d.clouds.transform_files import has_transform, transform_text
 
         if has_transform(answer):
             click.echo(transform_text(answer.T_target_source, []), nl=False)
@@ -141,9 +141,9 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
 def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> None:
     """Every output path is refused before the work begins, if it has to be refused at all."""
     from geomoe3d.clouds.io import WRITABLE_MESH_SUFFIXES, WRITABLE_SUFFIXES
+    from geomoe3d.clouds.transform_files import TRANSFORM_SUFFIXES, check_suffix
     from geomoe3d.errors import OutputError
-    from geomoe3d.files import check_output
-    from geomoe3d.transform_files import TRANSFORM_SUFFIXES, check_suffix
+    from geomoe3d.runtime.files import check_output
     from geomoe3d.visual.picture import FORMATS
 
     wanted = (
@@ -175,7 +175,7 @@ def _write(
     """Write what was asked for; what needs a transform where there is none is named on stderr."""
     from geomoe3d import __version__
     from geomoe3d.cli.summary import direction
-    from geomoe3d.transform_files import has_transform, save_result
+    from geomoe3d.clouds.transform_files import has_transform, save_result
 
     skipped: list[str] = []
     lost: tuple[str, ...] = ()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
+from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.result import CloudReport, RegistrationResult
-from geomoe3d.transform_files import has_transform
 from geomoe3d.types import FloatArray
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}

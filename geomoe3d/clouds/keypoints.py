@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.clouds.range_image import RangeImage
-from geomoe3d.threads import each
+from geomoe3d.runtime.threads import each
 from geomoe3d.types import FloatArray, IntArray
 
 PIXEL_DEG = 5.0

@@ -13,7 +13,7 @@ from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.columns import extents, largest_of_rows
-from geomoe3d.threads import each, usable_threads
+from geomoe3d.runtime.threads import each, usable_threads
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _AUTO_SAMPLE = 100_000  # points looked at when a voxel size is chosen: density is known well enough by then

@@ -21,7 +21,7 @@ from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import FormatError, InputError, NonFiniteError
-from geomoe3d.files import check_output, write_atomically
+from geomoe3d.runtime.files import check_output, write_atomically
 from geomoe3d.types import FloatArray
 
 _CLOUD_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
@@ -52,7 +52,7 @@ WRITABLE_MESH_SUFFIXES = (*_MESH_WRITERS, ".glb")
 
 
 def check_cloud_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str, ...]) -> Path:
-    """Find out before work begins whether a cloud can be written: `geomoe3d.files.check_output` and a suffix.
+    """Find out before work begins whether a cloud can be written there and under this suffix.
 
     Args:
         path: the file to be written.
@@ -64,7 +64,7 @@ def check_cloud_output(path: str | os.PathLike[str], force: bool, suffixes: tupl
 
     Raises:
         FormatError: another suffix; the message lists ``suffixes``.
-        OutputError: as `geomoe3d.files.check_output`.
+        OutputError: as `geomoe3d.runtime.files.check_output`.
     """
     if Path(path).suffix.lower() not in suffixes:
         raise FormatError(unknown_suffix(Path(path), suffixes, "writable"))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.data.collection import fragment_number, load_fragment
-from geomoe3d.files import write_atomically
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 
 _FRAGMENTS = 4

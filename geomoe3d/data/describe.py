@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.clouds.features import describe
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
@@ -23,8 +22,9 @@ from geomoe3d.data.fusion import measure_overlap
 from geomoe3d.data.shards import DescribedScene, is_shard, open_shard, why_stale, write_shard
 from geomoe3d.data.splits import split_of
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
+from geomoe3d.features.fpfh import describe
+from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.types import Float32Array, PointCloud
-from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 VOXEL_SIZE = 0.05
 

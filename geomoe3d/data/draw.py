@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from geomoe3d.clouds.matching import match
 from geomoe3d.config import MatchingConfig, Section
 from geomoe3d.data.shards import DescribedScene, open_shard, read_meta, shard_folders
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.matching.nearest import match
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, PreparedCloud
 
 ENDLESS = 1 << 40

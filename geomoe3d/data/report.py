@@ -10,7 +10,7 @@ import numpy as np
 
 from geomoe3d.data.statistics import BANDS
 from geomoe3d.data.synthesize import SynthesisReport
-from geomoe3d.files import write_text
+from geomoe3d.runtime.files import write_text
 
 
 def report_text(report: SynthesisReport) -> str:

@@ -74,8 +74,8 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
         InputError: the seed is negative.
     """
     from geomoe3d.clouds.io import save_points
-    from geomoe3d.files import check_output
-    from geomoe3d.transform_files import save_transform
+    from geomoe3d.clouds.transform_files import save_transform
+    from geomoe3d.runtime.files import check_output
 
     folder = Path(folder)
     try:

@@ -27,8 +27,8 @@ from geomoe3d.data.rooms.scenes import load_mesh_scene
 from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.files import write_text
-from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
+from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 MANIFEST = "manifest.json"
 _WRITING = ".writing-"

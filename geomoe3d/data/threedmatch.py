@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import inverse, is_motion, make_transform, project_to_so3
+from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
 
 BENCHMARKS = ("3DMatch", "3DLoMatch")

@@ -30,7 +30,7 @@ from geomoe3d.estimators.base import Estimator, check_correspondences
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread_shared, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.threads import each, single_blas_thread
+from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, IntArray
 
 _BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache

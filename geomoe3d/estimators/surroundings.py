@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.keypoints import PIXEL_DEG, KeypointSurfaces
 from geomoe3d.clouds.range_image import RangeImage
-from geomoe3d.threads import each
+from geomoe3d.runtime.threads import each
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, FloatArray, IntArray
 
 _PLANE_SIGMA = 0.3  # of the sine between a plane and the line to the other point, both scans' difference

@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geomoe3d.config import RegistrationConfig, load_config
-from geomoe3d.correspondence_solver import CorrespondenceSolver
+from geomoe3d.correspondence_registration import CorrespondenceSolver
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.evaluation.adapter import AdaptedFunction
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
 from geomoe3d.evaluation.records import Answer, Method, MethodInput
 from geomoe3d.filters.base import FilterOutput, resolved
-from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, find_weights
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, find_weights
 from geomoe3d.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -45,14 +45,14 @@ _UNDECIDING = frozenset({"evaluation", "cli", "visual", "data", "training", "bat
 _UNDECIDING_FILES = frozenset(
     {
         "__main__.py",
-        "config_text.py",
+        "clouds/transform_files.py",
         "doctor.py",
-        "files.py",
-        "journal.py",
-        "machine.py",
-        "provenance.py",
-        "transform_files.py",
-        "workers.py",
+        "runtime/config_text.py",
+        "runtime/files.py",
+        "runtime/journal.py",
+        "runtime/machine.py",
+        "runtime/provenance.py",
+        "runtime/workers.py",
     }
 )
 _MATCHING_CHANNELS = frozenset({"feature_distance", "ratio", "mutual"})
@@ -225,7 +225,7 @@ def hash_sources(root: Path) -> str:
     total = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         parts = path.relative_to(root).parts
-        if parts[0] in _UNDECIDING or (len(parts) == 1 and parts[0] in _UNDECIDING_FILES):
+        if parts[0] in _UNDECIDING or "/".join(parts) in _UNDECIDING_FILES:
             continue
         total.update("/".join(parts).encode() + b"\0")
         total.update(hashlib.sha256(path.read_bytes()).digest())

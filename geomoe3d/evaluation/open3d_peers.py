@@ -14,7 +14,7 @@ import numpy as np
 from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, LEAST_MATCHED, Peer
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.stages import StageClock
+from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray
 
 

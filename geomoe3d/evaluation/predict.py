@@ -36,10 +36,10 @@ from geomoe3d.evaluation.store import encode, open_run, remove_run
 from geomoe3d.evaluation.task import Task, fingerprint
 from geomoe3d.evaluation.tracks import InputMaker, needs
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.journal import Journal
-from geomoe3d.provenance import hardware, source_commit, usable_cores
+from geomoe3d.runtime.journal import Journal
+from geomoe3d.runtime.provenance import hardware, source_commit, usable_cores
+from geomoe3d.runtime.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.types import BoolArray, FloatArray
-from geomoe3d.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from geomoe3d.evaluation.report_tables import (
     swatch,
 )
 from geomoe3d.evaluation.report_words import LEGEND, benchmark_rank, run_key, warnings
-from geomoe3d.files import write_atomically
+from geomoe3d.runtime.files import write_atomically
 from geomoe3d.visual.page import fill_page
 
 

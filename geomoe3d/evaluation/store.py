@@ -19,8 +19,8 @@ import numpy as np
 
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
-from geomoe3d.files import write_text
-from geomoe3d.journal import Journal, read_journal
+from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.journal import Journal, read_journal
 from geomoe3d.types import BoolArray, FloatArray
 
 RUN_FILE = "run.json"

@@ -20,7 +20,7 @@ from geomoe3d.evaluation.report_words import run_key
 from geomoe3d.evaluation.store import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.evaluation.task import load_run_pairs
-from geomoe3d.files import write_text
+from geomoe3d.runtime.files import write_text
 
 REPORT_SUFFIXES = (".html", ".md", ".json")
 

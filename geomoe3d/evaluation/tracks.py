@@ -20,7 +20,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 import geomoe3d
-from geomoe3d.clouds.matching import nearest_features
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.collection import load_fragment
 from geomoe3d.data.describe import describe_fragment
@@ -28,6 +27,7 @@ from geomoe3d.data.threedmatch import BENCHMARKS, find_benchmark_root, load_fixe
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.records import VOXEL_SIZE, EvaluationPair, MethodInput
+from geomoe3d.matching.nearest import nearest_features
 from geomoe3d.types import Float32Array, FloatArray
 
 TRACKS = ("1k", "all", "clouds")

@@ -15,7 +15,7 @@ import numpy as np
 
 from geomoe3d.config import EstimatorConfig, FilterConfig, RegistrationConfig
 from geomoe3d.errors import ConfigError, DependencyError
-from geomoe3d.filters.weight_files import DEFAULT_WEIGHTS, packaged_names
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, packaged_names
 from geomoe3d.types import Correspondences
 from geomoe3d.types import FilterOutput as FilterOutput  # part of the form, offered here too
 
@@ -57,7 +57,7 @@ def _spectral(weights: str | None, estimator: EstimatorConfig) -> Filter:
 
 def _geomoe(weights: str | None, estimator: EstimatorConfig) -> Filter:
     try:
-        from geomoe3d.filters.geomoe_filter import geomoe_filter
+        from geomoe3d.filters.network import geomoe_filter
     except ImportError as error:
         raise DependencyError(
             f"the filter 'geomoe' needs PyTorch and safetensors ({error}); `geomoe3d doctor` gives the "

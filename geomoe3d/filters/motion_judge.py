@@ -22,14 +22,14 @@ from geomoe3d.errors import CheckpointError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.folded import FoldedGeoMoE, FoldedOutput
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.geomoe_filter import Insight, finite_part, run_several
-from geomoe3d.filters.inputs import MIN_CORRESPONDENCES, MotionInputs
-from geomoe3d.filters.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
-from geomoe3d.filters.pretrained import WeightCard, load_pretrained
-from geomoe3d.threads import each, single_blas_thread
+from geomoe3d.filters.network import Insight, finite_part, run_several
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.folded import FoldedGeoMoE, FoldedOutput
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.inputs import MIN_CORRESPONDENCES, MotionInputs
+from geomoe3d.networks.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
+from geomoe3d.networks.pretrained import WeightCard, load_pretrained
+from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, IntArray
 
 MOST_MOTIONS = 6
@@ -95,7 +95,7 @@ class MotionJudge:
         """Load a .safetensors file with its card, or weights that ship with the package.
 
         Raises:
-            CheckpointError: see `geomoe3d.filters.pretrained.load_pretrained`.
+            CheckpointError: see `geomoe3d.networks.pretrained.load_pretrained`.
         """
         model, card = load_pretrained(name_or_path)
         return cls(model, card, device)

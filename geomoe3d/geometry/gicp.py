@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from geomoe3d.geometry.se3 import inverse, project_to_so3, rotation_angle_deg
-from geomoe3d.threads import usable_threads
+from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import FloatArray
 
 LEAST_MATCHED = 10

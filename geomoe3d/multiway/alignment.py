@@ -18,7 +18,7 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import cross_matrix, inverse, make_transform, project_to_so3, transform_points
 from geomoe3d.multiway.overlaps import Overlaps
-from geomoe3d.threads import single_blas_thread
+from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
 _NUM_POINTS = 500  # of each scan, asked about each neighbour

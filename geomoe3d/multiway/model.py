@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.answer import library_versions
 from geomoe3d.batch.folder import foreign, has_mark, remove
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points, save_points
 from geomoe3d.clouds.prepare import voxel_means
+from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import inverse, shift_frames, transform_points
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.formats import g2o_text, kitti_text, tum_text
 from geomoe3d.multiway.scans import Scan
+from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
 
 POSES_FILE, PAGE_FILE = "poses.json", "page.html"

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.io import load_points
-from geomoe3d.files import write_text
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
+from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.page import base64_floats, fill_page
 from geomoe3d.visual.scene import thin

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from geomoe3d.threads import single_blas_thread
+from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, IntArray
 
 _WORDS = 64

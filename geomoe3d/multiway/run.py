@@ -28,7 +28,7 @@ from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_
 from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
 from geomoe3d.multiway.survey import Survey
-from geomoe3d.stages import StageClock
+from geomoe3d.runtime.timing import StageClock
 
 
 def register_scans(

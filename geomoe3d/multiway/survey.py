@@ -16,7 +16,6 @@ from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.journal import read_journal
 from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
 from geomoe3d.multiway.grouping import Group, GroupingRules, group_scans, settle
@@ -24,7 +23,8 @@ from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.proposals import most_similar, scan_similarity
 from geomoe3d.multiway.scans import Scan, natural_key
 from geomoe3d.registration import Registrar
-from geomoe3d.stages import StageClock
+from geomoe3d.runtime.journal import read_journal
+from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray
 
 _MOST_SETTLINGS = 3

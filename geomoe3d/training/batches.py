@@ -21,10 +21,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
-from geomoe3d.filters.architecture import NetworkConfig
-from geomoe3d.filters.inputs import BatchInput, MotionInputs, PairInput, collate, pair_input
 from geomoe3d.geometry.se3 import rotation_error_deg
-from geomoe3d.threads import THREADS_VARIABLE
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.inputs import BatchInput, MotionInputs, PairInput, collate, pair_input
+from geomoe3d.runtime.threads import THREADS_VARIABLE
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
 from geomoe3d.training.fragment_pairs import FragmentPairs

@@ -14,8 +14,8 @@ import torch
 from pydantic import ValidationError
 
 from geomoe3d.errors import CheckpointError
-from geomoe3d.files import write_atomically
-from geomoe3d.provenance import source_commit
+from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.config import FREE_KEYS, TrainConfig
 
 _FORMAT = "geomoe3d-checkpoint"

@@ -11,7 +11,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from geomoe3d.config import Section, build_config, read_yaml, set_keys
-from geomoe3d.filters.architecture import NetworkConfig
+from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.training.augment import AugmentationConfig
 from geomoe3d.training.losses import LossConfig
 from geomoe3d.training.synthetic import SyntheticConfig

@@ -9,7 +9,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.files import write_atomically
+from geomoe3d.runtime.files import write_atomically
 
 
 class CsvLog:

@@ -16,9 +16,9 @@ from pydantic import Field
 from torch import Tensor
 
 from geomoe3d.config import Section
-from geomoe3d.filters.geomoe import GeoMoEOutput
-from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.geometry.kabsch import weighted_kabsch
+from geomoe3d.networks.geomoe import GeoMoEOutput
+from geomoe3d.networks.layers import weights_from_logits
 
 _MIN_POSITIVE = 3
 

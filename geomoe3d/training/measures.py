@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.layers import weights_from_logits
 from geomoe3d.geometry.kabsch import weighted_kabsch
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.layers import weights_from_logits
 from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch
 
 

@@ -22,11 +22,11 @@ from geomoe3d.errors import InputError, OutputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.files import write_text
+from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.training.fragment_pairs import as_training_pair
 from geomoe3d.training.pairs import TrainingPair, write_shard
 from geomoe3d.types import BoolArray, Correspondences
-from geomoe3d.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 NUM_MOTIONS = 24
 PROPOSER_VERSION = 3

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from geomoe3d.filters.geomoe import GeoMoE
+from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.training.batches import TrainingSamples, make_batch, open_training
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.distributed import Process, choose_device

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from geomoe3d.filters.geomoe import GeoMoE, GeoMoEOutput
+from geomoe3d.networks.geomoe import GeoMoE, GeoMoEOutput
 from geomoe3d.training.batches import Batch
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.losses import Losses, total_loss

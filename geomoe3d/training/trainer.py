@@ -20,10 +20,10 @@ import torch
 from torch.nn.parallel import DistributedDataParallel
 
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
-from geomoe3d.files import write_text
-from geomoe3d.filters.geomoe import GeoMoE
-from geomoe3d.filters.pretrained import WeightCard, load_pretrained, save_pretrained
-from geomoe3d.provenance import source_commit
+from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples
 from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from geomoe3d.training.config import TrainConfig

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.files import write_atomically
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray, IntArray
 from geomoe3d.visual.paper import number
 from geomoe3d.visual.scene import (

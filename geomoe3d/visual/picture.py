@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geomoe3d.errors import FormatError
-from geomoe3d.files import write_atomically
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.panels import draw_correspondences, draw_facts, draw_residuals
 from geomoe3d.visual.paper import (

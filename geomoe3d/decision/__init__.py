@@ -1,0 +1,1 @@
+"""Scored hypotheses to an answer: selection, confidence, result."""

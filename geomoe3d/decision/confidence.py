@@ -1,0 +1,255 @@
+"""How sure: status, reasons and confidence from the evidence, and the information of the fit.
+
+Place: judge, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
+the clouds, its lead over the best clearly different motion, the overlap, how firmly the shared surface holds
+the source and its sensor, and the share of correspondences that agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomoe3d.config import JudgementConfig
+from geomoe3d.geometry.se3 import cross_matrix, transform_points
+from geomoe3d.result import Status
+from geomoe3d.scoring.surfaces import Evidence
+from geomoe3d.types import FloatArray, PreparedCloud
+
+# Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
+# one, mixed by overlap as the benchmarks are, and on unrelated pairs: 300 and 150 pairs, each with one look
+# and with two; docs/measurements.md holds what came of it on real scans.
+# Offset and slopes by (heard a network, asked free space). Where it is not known what must be empty, the same
+# evidence is worth less; without a network a clear lead makes up for it.
+_COEFFICIENTS = {
+    (True, True): (-1.133, np.array([0.954, 0.998, -3.072, 0.794, -2.45, 0.658, -74.012])),
+    (False, True): (-1.216, np.array([0.888, 2.244, -3.972, 0.435, -3.014, 1.249, -74.871])),
+    (True, False): (-7.984, np.array([1.953, 1.534, -4.965, 0.444, -2.722, 0.169, 0.0])),
+    (False, False): (-1.976, np.array([1.813, 3.895, -5.902, 1.117, -2.994, 1.447, 0.0])),
+}
+_LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002, 0.01, 1e-3
+_LEAST_LOOSENESS, _MOST_LOOSENESS = 0.02, 10.0
+_LOOSEST = 1000.0
+_ASKED = 200  # points of a scan of unknown sensor whose deviation is asked for
+_MOST_LEAD = 30.0
+_MOST_VIOLATION = 0.1
+UNRIVALLED_LEAD = 3.0
+_LIKELY = 0.5
+_CLOSE_VERDICTS = 2.0  # odds of seven to one
+_LEAST_OBSERVABILITY = 0.005
+_LOW_OVERLAP = 0.1
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Status with its reasons, sentences, and the confidence in [0, 1]."""
+
+    status: Status
+    reasons: tuple[str, ...]
+    confidence: float
+
+
+@dataclass(frozen=True)
+class Information:
+    """How firmly the overlapping surfaces hold the motion.
+
+    Attributes:
+        matrix: (6, 6) sum of J^T J / variance, J = [(x - c) x n, n] per matched point: order [rotation
+            (rad), translation], target axes, about ``center``; 1 / cloud unit^2 where it applies.
+        center: (3,) centroid c of the matched points, target local coordinates.
+        observability: smallest eigenvalue of the same sum per point with lengths divided by the root mean
+            square radius; 1/3 would be held equally from all sides, 0 means that the source can slide.
+        num_matched: matched points.
+        looseness: standard deviation of where the motion puts the source's sensor, in voxels, if the gaps
+            between the surfaces were independent from point to point; where no place is known or guessed, of
+            the most loosely held twentieth of its points. They are not independent, so it tells a loose fit
+            from a firm one and is no error bar. Of the source alone, so exchanging the scans may change it.
+            At most 1000, which is also what stands for fewer than 6 points.
+        sensors_known: whether both sensors' places are known or guessed, so that free space could be asked.
+    """
+
+    matrix: FloatArray
+    center: FloatArray
+    observability: float
+    num_matched: int
+    looseness: float = _LOOSEST
+    sensors_known: bool = False
+
+
+def measure_information(
+    T_target_source: FloatArray, source: PreparedCloud, target: PreparedCloud, threshold: float
+) -> Information:
+    """Point-to-plane information of a motion over source points within ``threshold`` of the target.
+
+    Returns NaN matrices, observability 0 and looseness 1000 for fewer than 6 matched points.
+    """
+    from scipy.spatial import cKDTree
+
+    known = source.viewpoint is not None and target.viewpoint is not None
+    moved = transform_points(T_target_source, source.points)
+    distance, nearest = cKDTree(target.points).query(moved, distance_upper_bound=threshold)
+    distance, nearest = np.asarray(distance), np.asarray(nearest)
+    hit = np.isfinite(distance)
+    if hit.sum() < 6:
+        return Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, int(hit.sum()), _LOOSEST, known)
+    points, normals = moved[hit], target.normals[nearest[hit]]
+    gaps = np.einsum("ij,ij->i", points - target.points[nearest[hit]], normals)
+    center = points.mean(0)
+    J = np.hstack([np.cross(points - center, normals), normals])
+    # Points on one voxel grid cannot be trusted below a tenth of its edge.
+    variance = max(float(np.mean(gaps**2)), (0.1 * source.voxel_size) ** 2)
+    radius = float(np.sqrt(np.mean(np.sum((points - center) ** 2, axis=1))))
+    scaled = J / np.array([radius] * 3 + [1.0] * 3)
+    smallest = float(np.linalg.eigvalsh(scaled.T @ scaled / len(points))[0])
+    matrix = J.T @ J / variance
+    places = source.points[:: -(-len(source) // _ASKED)]
+    if source.viewpoint is not None:
+        places = source.viewpoint[None]
+    deviations = deviations_at(matrix, center, transform_points(T_target_source, places)) / source.voxel_size
+    looseness = float(np.quantile(np.minimum(deviations, _LOOSEST), 0.95))
+    return Information(matrix, center, max(smallest, 0.0), int(hit.sum()), looseness, known)
+
+
+def deviations_at(matrix: FloatArray, center: FloatArray, points: FloatArray) -> FloatArray:
+    """Standard deviations (n,) of where a motion puts points (n, 3), by its information about ``center``.
+
+    inf where the matrix holds nothing at all.
+    """
+    turning, shifting = np.trace(matrix[:3, :3]), np.trace(matrix[3:, 3:])
+    if not shifting > 0:
+        return np.full(len(points), np.inf)
+    # With lengths over the radius of what is shared, what is next to nothing does not depend on the unit.
+    scale = np.array([max(np.sqrt(turning / shifting), 1e-12)] * 3 + [1.0] * 3)
+    scaled = matrix / np.outer(scale, scale)
+    # Never singular: what nothing holds may be anywhere.
+    covariance = np.linalg.inv(scaled + 1e-12 * np.trace(scaled) * np.eye(6))
+    # p + w x (p - c) + v
+    J = np.array([np.hstack([-cross_matrix(point - center), np.eye(3)]) for point in points]) / scale
+    variance = np.einsum("nij,jk,nik->n", J, covariance, J)
+    deviations: FloatArray = np.sqrt(np.maximum(variance, 0.0))
+    return deviations
+
+
+def judge(
+    evidence: Evidence,
+    lead: float,
+    support: float,
+    information: Information,
+    config: JudgementConfig,
+    rival: Evidence | None = None,
+) -> Judgement:
+    """Decide whether an answer may be believed.
+
+    Args:
+        evidence: of the answer, after refinement.
+        lead: as `lead_over` gives it.
+        support: share of the correspondences that agree with the answer.
+        information: of the answer.
+        config: thresholds.
+        rival: of the best clearly different motion, if there is one.
+
+    Returns:
+        ``ambiguous`` where the surfaces let the source slide, or where the answer would be likely but another
+        motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
+    """
+    confidence = confidence_score(evidence, lead, support, information)
+    notes = []
+    if evidence.overlap < _LOW_OVERLAP:
+        notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
+    if evidence.free_space_violation > 0.1:
+        notes.append(
+            "parts lie where the other scan's sensor saw free space "
+            f"(rate {evidence.free_space_violation:.2f})"
+        )
+    if information.observability < _LEAST_OBSERVABILITY:
+        notes.append(
+            "the shared surface lets the source slide or turn along itself "
+            f"(observability {information.observability:.4f}, needs {_LEAST_OBSERVABILITY}): it is too "
+            "plain, like a single plane or cylinder"
+        )
+        return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
+    # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
+    alone = confidence_score(evidence.by_clouds(), UNRIVALLED_LEAD, support, information)
+    close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(evidence, rival, config.ambiguity_ratio)
+    if close and alone >= _LIKELY:
+        notes.append(
+            f"a clearly different motion does {min(100 / lead, 100):.0f} % as well; see the alternative, "
+            "the scans may show repeated or symmetric structure"
+        )
+        return Judgement("ambiguous", tuple(notes), min(confidence, 0.5))
+    if confidence < config.min_confidence:
+        notes.append(
+            f"confidence {confidence:.2f} is below {config.min_confidence:.2f}: the scans may not overlap, "
+            "or share too little distinctive surface"
+        )
+        return Judgement("low_confidence", tuple(notes), confidence)
+    return Judgement("ok", tuple(notes), confidence)
+
+
+def _hardly_told_apart(evidence: Evidence, rival: Evidence | None, ratio: float) -> bool:
+    """Whether the clouds like both about as well and the network's verdicts lie close together."""
+    if rival is None or evidence.verdict is None or rival.verdict is None:
+        return False
+    alike = rival.surface_score >= ratio * evidence.surface_score
+    return alike and abs(evidence.verdict - rival.verdict) < _CLOSE_VERDICTS
+
+
+def lead_over(evidence: Evidence, other: Evidence | None) -> float:
+    """Score of the answer over that of the best clearly different motion.
+
+    inf where the other scores nothing; 3 where no different motion was proposed at all, since an answer
+    without a rival has not beaten one; 1 where neither scores.
+    """
+    if evidence.score <= 0:
+        return 1.0
+    if other is None:
+        return UNRIVALLED_LEAD
+    return evidence.score / other.score if other.score > 0 else float("inf")
+
+
+CONFIDENCE_INPUTS = (
+    "log evidence",
+    "log lead",
+    "log overlap",
+    "log observability",
+    "log looseness",
+    "log support",
+    "free-space violation",
+)
+"""What the confidence is made of, in the order of `confidence_inputs`."""
+
+
+def confidence_inputs(
+    evidence: Evidence, lead: float, support: float, information: Information
+) -> FloatArray:
+    """(7,) natural logarithms, bounded below and the lead above too; see `judge` for the arguments.
+
+    More overlap at equal evidence is a bad sign: it is evidence by chance that grows with it. A surface that
+    hardly holds the source is one: the answer may have slid off along it; and one that leaves the sensor
+    loose, far off at the end of a lever, is the worst. The violation enters as it is, bounded, beside its
+    part in the evidence, which choosing needs but which is not all that it says of the answer. The verdict of
+    a network enters through the lead alone: by itself it is surer on scans like those it was trained on.
+    """
+    return np.append(
+        np.log(
+            [
+                max(evidence.surface_score, _LEAST_SCORE),
+                min(max(lead, 0.5), _MOST_LEAD),
+                evidence.overlap + _LEAST_OVERLAP,
+                information.observability + _ADDED_OBSERVABILITY,
+                min(max(information.looseness, _LEAST_LOOSENESS), _MOST_LOOSENESS),
+                support + _LEAST_SUPPORT,
+            ]
+        ),
+        min(evidence.free_space_violation, _MOST_VIOLATION),
+    )
+
+
+def confidence_score(evidence: Evidence, lead: float, support: float, information: Information) -> float:
+    """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
+    if evidence.score <= 0:
+        return 0.0
+    offset, slopes = _COEFFICIENTS[evidence.verdict is not None, information.sensors_known]
+    strength = offset + confidence_inputs(evidence, lead, support, information) @ slopes
+    return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

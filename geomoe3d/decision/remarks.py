@@ -1,0 +1,60 @@
+"""What deserves a user's attention beside the judgement: sentences on input and settings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from geomoe3d.config import PreparationConfig
+from geomoe3d.decision.confidence import Judgement
+from geomoe3d.types import PreparedCloud
+
+_FEW_VOXELS = 100  # far below what the chosen grid aims at
+
+
+def remarks(
+    given: tuple[Any, Any],
+    described: tuple[PreparedCloud, PreparedCloud],
+    wanted: float,
+    sensors_known: bool,
+    config: PreparationConfig,
+    judgement: Judgement,
+) -> Iterator[str]:
+    """Sentences to be added to the reasons of a result.
+
+    Args:
+        given: source and target as the user gave them.
+        described: the same on their grid.
+        wanted: edge of the grid that was asked for or chosen, before the limit of voxels.
+        sensors_known: whether the sensors' places were believed, not guessed.
+        config: of the preparation.
+        judgement: of the answer; where that is ok, nothing is said of what might make it better.
+    """
+    voxel_size = described[0].voxel_size
+    if voxel_size > wanted:
+        yield (
+            f"a voxel size of {wanted:.4g} gives more than {config.max_points} voxels; "
+            f"{voxel_size:.4g} was used (preparation.max_points sets the limit)"
+        )
+    if _is_one_file(given):
+        yield "source and target are the same file"
+    if judgement.status == "ok":
+        return
+    fewest = min(described, key=len)
+    if len(fewest) < _FEW_VOXELS:
+        yield (
+            f"'{fewest.name}' fills only {len(fewest)} voxels of edge {voxel_size:.4g}; a smaller voxel size "
+            "leaves more to go by"
+        )
+    if not sensors_known and config.viewpoint in ("auto", "guess"):
+        yield (
+            "where the sensors stood is not known and was guessed; if they stood at the files' origins, "
+            "preparation.viewpoint=origin says so, and more answers are right"
+        )
+
+
+def _is_one_file(given: tuple[Any, Any]) -> bool:
+    paths = [Path(data) for data in given if isinstance(data, (str, os.PathLike))]
+    return len(paths) == 2 and paths[0].resolve() == paths[1].resolve()  # asks for no file that may be gone

@@ -1,0 +1,1 @@
+"""Preprocessed clouds to features: descriptors, and their cache on disk."""

@@ -1,0 +1,1 @@
+"""GeoMoE and its parts: architecture, blocks, inputs, inference, weights on disk."""

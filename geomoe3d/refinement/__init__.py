@@ -1,0 +1,1 @@
+"""Transforms polished on the clouds."""

@@ -1,0 +1,1 @@
+"""Work around the method: files, journals, processes, threads, timing, provenance."""

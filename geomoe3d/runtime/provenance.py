@@ -1,0 +1,50 @@
+"""Where a number comes from: the commit of the code and the machine, for cards, caches and reports."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+from geomoe3d import __version__
+
+
+def source_commit() -> str:
+    """Revision of the source that runs, ``-dirty`` where files differ from it, or the installed version."""
+    root = Path(__file__).resolve().parents[2]
+    if (root / ".git").exists():
+        command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+            return done.stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            pass
+    return f"geomoe3d {__version__}"
+
+
+def hardware() -> str:
+    """Processor, cores and memory in one line."""
+    model = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+                break
+    except OSError:
+        pass
+    cores = usable_cores()
+    text = f"{model}, {cores} core{'s' if cores != 1 else ''}"
+    try:
+        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):
+        return text
+    return f"{text}, {size / 2**30:.0f} GiB"
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1

@@ -1,0 +1,1 @@
+"""Hypotheses to scores: what the clouds and a network say of a transform."""

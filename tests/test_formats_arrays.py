@@ -11,6 +11,8 @@ import pytest
 from cloud_files import cloud, fails, small_cloud
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.loading import read_raw
+from geomoe3d.errors import FormatError, InputError
 
 
 @pytest.mark.parametrize("key", ["points", "xyz", "pcd", "pos", "XYZ", "arr_0", "whatever"])
@@ -44,7 +46,7 @@ def test_pickles_are_not_loaded(tmp_path: Path) -> None:
     [
         np.zeros(9),
         np.zeros((3, 2)),
-        np.zeros((2, 3, 3)),
+        np.zeros((2, 3, 4)),
         np.zeros((5, 3), complex),
         np.array([["a", "b", "c"]]),
     ],
@@ -80,3 +82,37 @@ def test_truncated_and_misnamed_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", small_cloud())
     (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes().replace(b"(100, 3)", b"(60,  3)"))
     fails(tmp_path / "a.npy", 128 + 2400, 128 + 60 * 24)
+
+
+@pytest.mark.parametrize("shape", [(3, 100), (3, 4)])
+def test_a_cloud_on_its_side_is_refused_as_in_memory(tmp_path: Path, shape: tuple[int, int]) -> None:
+    np.save(tmp_path / "a.npy", np.ones(shape))
+    np.savez(tmp_path / "a.npz", points=np.ones(shape))
+    for data, error in (("a.npy", FormatError), ("a.npz", FormatError), (None, InputError)):
+        fails(np.ones(shape) if data is None else tmp_path / data, "pass points.T", str(shape), error=error)
+
+
+def test_organised_and_structured_arrays(tmp_path: Path) -> None:
+    points = small_cloud(20)
+    rows = np.zeros(20, [("intensity", "u2"), ("X", "f8"), ("Y", "f8"), ("Z", "f8"), ("tag", "S3")])
+    rows["X"], rows["Y"], rows["Z"] = points.T
+    rows["intensity"] = np.arange(20)
+    triples = np.zeros((4, 5), [("xyz", "f8", 3), ("normal", "f4", 3), ("rgb", "u1", 3), ("t", "f8")])
+    triples["xyz"], triples["normal"], triples["rgb"] = points.reshape(4, 5, 3), [0, 0, 1], [255, 0, 51]
+    for name, array in (("grid", points.reshape(4, 5, 3)), ("rows", rows), ("triples", triples)):
+        np.save(tmp_path / f"{name}.npy", array)
+        for data in (tmp_path / f"{name}.npy", array):
+            assert np.array_equal(read_raw(data).points, points)
+    assert read_raw(tmp_path / "grid.npy").unread == ("grid of 5 x 4",)
+    cloud = read_raw(rows)
+    assert np.array_equal(cloud.fields["intensity"], np.arange(20)) and cloud.unread == ("tag",)
+    cloud = load_points(triples)
+    assert np.array_equal(cloud.normals, np.tile([0, 0, 1.0], (20, 1)))
+    np.testing.assert_allclose(cloud.colors, np.tile([1, 0, 0.2], (20, 1)))
+    fails(np.zeros(5, [("a", "f8")]), "fields a", error=InputError)
+
+
+def test_arrays_beside_the_points_are_fields(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", points=small_cloud(5), ring=np.arange(5), K=np.eye(3))
+    cloud = read_raw(tmp_path / "a.npz")
+    assert np.array_equal(cloud.fields["ring"], np.arange(5)) and cloud.unread == ("K",)

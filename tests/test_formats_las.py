@@ -50,8 +50,9 @@ def test_truncated_and_lying_las(tmp_path: Path, suffix: str) -> None:
         fails(path, path.name)
     path.write_bytes(whole[:-300])
     fails(path, "says 100 points", "holds")
-    for said in (150_000, 60) if suffix == ".las" else (150_000,):
-        path.write_bytes(whole[:107] + struct.pack("<I", said) + whole[111:])
-        fails(path, f"says {said} points", "holds 100;" if suffix == ".las" else "holds 1 chunks")
+    path.write_bytes(whole[:107] + struct.pack("<I", 150_000) + whole[111:])
+    fails(path, "says 150000 points", "holds 100;" if suffix == ".las" else "holds 1 chunks")
+    path.write_bytes(whole[:107] + struct.pack("<I", 60) + whole[111:])  # PDAL reads so many too
+    np.testing.assert_allclose(load_points(path).file_points, small_cloud()[:60], atol=1e-6)
     path.write_bytes(b"hello world" * 100)
     fails(path, "no LAS file")

@@ -98,3 +98,13 @@ def test_truncated_ascii_stl_and_obj_faces(tmp_path: Path) -> None:
 def test_mesh_without_area(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     fails(tmp_path / "a.obj", "area 0", error=InputError)
+
+
+def test_stl_with_bytes_behind_its_faces(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.box().export(tmp_path / "a.stl")
+    (tmp_path / "a.stl").write_bytes((tmp_path / "a.stl").read_bytes() + b"made by a CAD program" * 5)
+    assert_on_box(load_points(tmp_path / "a.stl", mesh_points=400).points, 400)
+    solid = b"solid" + (tmp_path / "a.stl").read_bytes()[5:]  # binary all the same
+    (tmp_path / "a.stl").write_bytes(solid[: 84 + 12 * 50])
+    assert_on_box(load_points(tmp_path / "a.stl", mesh_points=400).points, 400)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from cloud_files import UTM, cloud, fails, pcd, small_cloud, unit_vectors
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.loading import read_raw
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -72,7 +74,7 @@ def test_damaged_pcd_is_quiet(tmp_path: Path, capfd: pytest.CaptureFixture[str])
     whole = bytearray(pcd(100, 100, "binary_compressed"))
     whole[-2000:] = b"\xff" * 2000
     (tmp_path / "a.pcd").write_bytes(whole)
-    fails(tmp_path / "a.pcd", "0 of 100 points")
+    fails(tmp_path / "a.pcd", "compressed part is damaged")
     assert capfd.readouterr() == ("", "")
 
 
@@ -92,3 +94,74 @@ def test_damaged_pcd_is_quiet(tmp_path: Path, capfd: pytest.CaptureFixture[str])
 def test_malformed_pcd_headers(tmp_path: Path, old: str, new: str, word: str) -> None:
     (tmp_path / "a.pcd").write_bytes(pcd(5, 5, "ascii").replace(old.encode(), new.encode(), 1))
     fails(tmp_path / "a.pcd", word)
+
+
+@pytest.mark.parametrize("rows", [60, 5000])
+def test_all_modes_give_the_same_cloud(tmp_path: Path, rows: int) -> None:
+    """Also where the compressed form repeats itself, and with fields of any width and of several values."""
+    points = np.round(small_cloud(rows), 1).astype("<f4")
+    ring, time = np.arange(rows, dtype="<u2") % 64, np.linspace(0, 0.1, rows)
+    rgb = np.full(rows, 0x00FF8040, "<u4")
+    histogram = np.ones((rows, 3), "<f4")
+    head = "VERSION 0.7\nFIELDS x y z _ ring time rgb fpfh\nSIZE 4 4 4 1 2 8 4 4\nTYPE F F F U U F U F\n"
+    head += f"COUNT 1 1 1 4 1 1 1 3\nWIDTH {rows // 10}\nHEIGHT 10\nVIEWPOINT 1 0 0 1 0 0 0\nDATA "
+    columns = [*points.T, np.zeros((rows, 4), "u1"), ring, time, rgb, histogram]
+    table = np.column_stack([column.reshape(rows, -1).astype(float) for column in columns])
+    text = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in table)
+    (tmp_path / "ascii.pcd").write_text(f"{head}ascii\n{text}\n")
+    types = "f4, f4, f4, 4u1, u2, f8, u4, 3f4"
+    body = np.empty(rows, types)
+    for k, column in enumerate(columns):
+        body[f"f{k}"] = column
+    (tmp_path / "binary.pcd").write_bytes(f"{head}binary\n".encode() + body.tobytes())
+    plain = b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
+    packed = lzf(plain)
+    assert len(packed) < 0.7 * len(plain)
+    sizes = struct.pack("<II", len(packed), len(plain))
+    (tmp_path / "lzf.pcd").write_bytes(f"{head}binary_compressed\n".encode() + sizes + packed)
+    for name in ("ascii", "binary", "lzf"):
+        cloud = read_raw(tmp_path / f"{name}.pcd")
+        np.testing.assert_allclose(cloud.points, points, atol=1e-6)
+        np.testing.assert_array_equal(cloud.fields["ring"], ring)
+        np.testing.assert_array_equal(cloud.fields["time"], time)
+        assert set(cloud.fields) == {"ring", "time"} and cloud.fields["ring"].dtype == np.uint16
+        np.testing.assert_allclose(cloud.colors, np.tile([1, 128 / 255, 64 / 255], (rows, 1)))
+        pose = "sensor pose (VIEWPOINT 1 0 0 1 0 0 0)"
+        assert cloud.unread == ("fpfh", pose, f"grid of {rows // 10} x 10")
+
+
+def lzf(plain: bytes) -> bytes:
+    """A simple packer: what was seen in the last 8 KB is referred to, also where it runs into itself."""
+    out, literal, place = bytearray(), bytearray(), 0
+    seen: dict[bytes, int] = {}
+
+    def flush() -> None:
+        for k in range(0, len(literal), 32):
+            out.append(len(literal[k : k + 32]) - 1)
+            out.extend(literal[k : k + 32])
+        literal.clear()
+
+    while place < len(plain):
+        key = plain[place : place + 3]
+        back = place - seen.get(key, place)
+        seen[key] = place
+        if len(key) < 3 or not 0 < back <= 8192:
+            literal.append(plain[place])
+            place += 1
+            continue
+        length = 3
+        while (
+            length < 264
+            and place + length < len(plain)
+            and plain[place + length - back] == plain[place + length]
+        ):
+            length += 1
+        flush()
+        code = min(length - 2, 7)
+        out.append(code << 5 | (back - 1) >> 8)
+        if code == 7:
+            out.append(length - 9)
+        out.append((back - 1) & 255)
+        place += length
+    flush()
+    return bytes(out)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_files import UTM, assert_on_box, cloud, fails, ply, unit_vectors
+from cloud_files import UTM, assert_on_box, cloud, fails, ply, small_cloud, unit_vectors
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.loading import read_raw
 from geomoe3d.errors import EmptyCloudError
 
 PLY_TYPES = {"float": "f4", "double": "f8", "int": "i4", "short": "i2", "uchar": "u1", "float32": "f4"}
@@ -193,7 +194,7 @@ def test_ply_face_of_a_missing_vertex(tmp_path: Path) -> None:
         ("element vertex 3", "element vertex many", "'many'"),
         ("property double x", "property double a", "only: a, y, z"),
         ("property double x", "property quad x", "property quad x"),
-        ("property double x", "property list uchar double x", "list properties"),
+        ("property double x", "property list uchar double x", "only: y, z"),
         ("end_header", "", "header line"),
     ],
 )
@@ -215,3 +216,48 @@ def test_ply_garbage_names_the_line(tmp_path: Path) -> None:
     lines[8] = "1 two 3"
     (tmp_path / "a.ply").write_text("\n".join(lines))
     fails(tmp_path / "a.ply", "line 9", "1 two 3")
+
+
+@pytest.mark.parametrize("fmt", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("ragged", [False, True])
+def test_lists_of_vertices_are_stepped_over(tmp_path: Path, fmt: str, ragged: bool) -> None:
+    """As photogrammetry writes them: which cameras see a point, and how well."""
+    points, views = small_cloud(300), np.random.default_rng(0).integers(0, 5 if ragged else 1, 300)
+    header = f"ply\nformat {fmt} 1.0\nelement vertex 300\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz")
+    header += "property list uchar uint view_indices\nproperty uchar level\nproperty list int float weights\n"
+    header += "element face 2\nproperty list uchar int vertex_indices\nproperty float quality\nend_header\n"
+    order = ">" if "big" in fmt else "<"
+    rows = []
+    for k, (p, n) in enumerate(zip(points, views.tolist(), strict=True)):
+        if fmt == "ascii":
+            numbers = [*map(repr, p.tolist()), n, *range(n), k % 7, n, *([0.5] * n)]
+            rows.append(" ".join(map(str, numbers)).encode() + b"\n")
+        else:
+            rows.append(struct.pack(f"{order}3dB{n}IBi{n}f", *p, n, *range(n), k % 7, n, *([0.5] * n)))
+    faces = b"3 0 1 2 0.5\n4 3 4 5 6 1.5\n"
+    if fmt != "ascii":
+        faces = struct.pack(f"{order}B3ifB4if", 3, 0, 1, 2, 0.5, 4, 3, 4, 5, 6, 1.5)
+    (tmp_path / "a.ply").write_bytes(header.encode() + b"".join(rows) + faces)
+    cloud = read_raw(tmp_path / "a.ply")
+    assert np.array_equal(cloud.points, points)
+    assert np.array_equal(cloud.faces, [[0, 1, 2], [3, 4, 5], [3, 5, 6]])
+    assert (
+        np.array_equal(cloud.fields["level"], np.arange(300) % 7) and cloud.fields["level"].dtype == np.uint8
+    )
+    assert cloud.unread == ("view_indices", "weights", "face quality")
+    (tmp_path / "a.ply").write_bytes(header.encode() + b"".join(rows[:200]))
+    fails(tmp_path / "a.ply", "says 300 rows of 'vertex'", "holds 200;")
+
+
+def test_ascii_values_may_run_over_lines(tmp_path: Path) -> None:
+    words = ply(50, 50).decode().split("end_header\n")
+    (tmp_path / "a.ply").write_text(words[0] + "end_header\n" + "\n".join(words[1].split()) + "\n")
+    assert np.array_equal(load_points(tmp_path / "a.ply").file_points, small_cloud(50))
+
+
+def test_equal_names_of_properties(tmp_path: Path) -> None:
+    text = ply(2, 0).decode().replace("property double z\n", "property double z\nproperty float z\n")
+    (tmp_path / "a.ply").write_text(text + "1 2 3 4\n5 6 7 8\n")
+    cloud = read_raw(tmp_path / "a.ply")
+    assert np.array_equal(cloud.points, [[1, 2, 3], [5, 6, 7]]) and np.array_equal(cloud.fields["z"], [4, 8])

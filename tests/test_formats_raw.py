@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_files import cloud, unit_vectors
+from cloud_files import cloud, fails, unit_vectors
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.loading import read_raw
 from geomoe3d.types import PointCloud
 
 
@@ -46,21 +47,36 @@ def test_six_and_nine_columns_without_names(tmp_path: Path, suffix: str) -> None
         np.save(path, table) if suffix == ".npy" else np.savetxt(path, table, fmt="%.17g")
         return load_points(path)
 
-    with_normals, with_colors, with_both = (
-        load(points, normals),
-        load(points, colors),
-        load(points, colors, normals),
-    )
-    for loaded, has_normals, has_colors in (
-        (with_normals, True, False),
-        (with_colors, False, True),
-        (load(points, colors / 255), False, True),
-        (with_both, True, True),
-        (load(points, normals, colors), True, True),
-        (load(points, normals * 300.0), False, False),
-        (load(points, colors + 300.0), False, False),
+    with_normals = load(points, normals)
+    with_both = load(points, colors, normals)
+    flags = np.eye(3)[np.arange(200) % 3]
+    for loaded, has_normals in (
+        (with_normals, True),
+        (with_both, True),
+        (load(points, normals, colors), True),
+        (load(points, colors), False),
+        (load(points, colors / 255), False),
+        (load(points, flags), False),
+        (load(points, normals * 300.0), False),
     ):
         assert np.array_equal(loaded.points, points)
-        assert (loaded.normals is not None, loaded.colors is not None) == (has_normals, has_colors)
-    np.testing.assert_allclose(with_both.colors, colors / 255)
+        assert (loaded.normals is not None) == has_normals
+        assert loaded.colors is None, "what could be colours could be intensity, ring and time"
     np.testing.assert_allclose(with_both.normals, normals, atol=1e-15)
+    load(points, np.arange(200.0)[:, None] % 128)
+    assert read_raw(path).fields["column_4"][129] == 1
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".npy"])
+@pytest.mark.parametrize("numbers", [np.arange(200.0), 1000 + 10 * np.arange(200.0), np.arange(200.0) ** 2])
+def test_a_leading_point_number_is_asked_about(tmp_path: Path, suffix: str, numbers: np.ndarray) -> None:
+    path = tmp_path / f"a{suffix}"
+    table = np.column_stack([numbers, cloud()])
+    np.save(path, table) if suffix == ".npy" else np.savetxt(path, table, fmt="%.17g")
+    fails(path, "point numbers", "name the columns", f"to {numbers[-1]:.0f}")
+    if suffix == ".txt":
+        path.write_text("id x y z\n" + path.read_text())
+        np.testing.assert_array_equal(load_points(path).points, cloud())
+    profile = np.column_stack([np.arange(200.0), cloud()[:, 1:]])  # three columns are coordinates
+    np.save(path, profile) if suffix == ".npy" else np.savetxt(path, profile, fmt="%.17g")
+    assert len(load_points(path)) == 200

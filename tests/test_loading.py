@@ -92,10 +92,20 @@ def test_unknown_suffix_names_the_nearest(tmp_path: Path, name: str, nearest: st
     fails(tmp_path / name, f"did you mean {nearest}?", *READABLE_SUFFIXES)
 
 
-@pytest.mark.parametrize("name", ["noend", "a.mp4", "a.ply.gz"])
+@pytest.mark.parametrize("name", ["noend", "a.mp4", "a.plx.gz"])
 def test_other_suffixes_list_all(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("1 2 3")
     fails(tmp_path / name, *READABLE_SUFFIXES)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("a.zip", "unpack"), ("a.rcp", "E57"), ("a.pcap", "recording"), ("a.fbx", "OBJ"), ("a.pkl", "pickled")],
+)
+def test_unknown_suffixes_by_what_they_are(tmp_path: Path, name: str, meant: str) -> None:
+    (tmp_path / name).write_text("1 2 3")
+    message = fails(tmp_path / name, meant, *READABLE_SUFFIXES)
+    assert "did you mean" not in message
 
 
 @pytest.mark.parametrize("suffix", READABLE_SUFFIXES)

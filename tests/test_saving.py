@@ -69,12 +69,12 @@ def test_what_is_not_carried_over_is_named(tmp_path: Path, kind: str) -> None:
         held.intensity[:] = 7
         held.write(path)
     expected = ("intensity",) if kind == "las" else ("intensity", "label")
-    assert save_aligned(tmp_path / "b.ply", path, np.eye(4)) == expected
+    assert save_aligned(tmp_path / "b.npy", path, np.eye(4)) == expected
     save_points(tmp_path / "c.ply", points, normals=unit_vectors(20))
     assert save_aligned(tmp_path / "d.ply", tmp_path / "c.ply", np.eye(4)) == ()
     assert save_aligned(tmp_path / "d.npy", tmp_path / "c.ply", np.eye(4)) == ("normals",)
-    np.savez(tmp_path / "e.npz", points=points, time=np.zeros(20))
-    assert save_aligned(tmp_path / "f.ply", tmp_path / "e.npz", np.eye(4)) == ("time",)
+    np.savez(tmp_path / "e.npz", points=points, K=np.eye(3))
+    assert save_aligned(tmp_path / "f.ply", tmp_path / "e.npz", np.eye(4)) == ("K",)
 
 
 @pytest.mark.parametrize("source_suffix", [".obj", ".stl", ".ply", ".glb"])
@@ -184,13 +184,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_rest(
 
     path = tmp_path / f"a{suffix}"
     path.write_text("precious")
-    real = saving._CLOUD_WRITERS[suffix]
+    real = saving.CLOUD_WRITERS[suffix]
 
     def full_disk(handle, cloud) -> None:
         real(handle, cloud)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(saving._CLOUD_WRITERS, suffix, full_disk)
+    monkeypatch.setitem(saving.CLOUD_WRITERS, suffix, full_disk)
     with pytest.raises(OutputError, match="No space left"):
         save_points(path, small_cloud(), force=True)
     assert path.read_text() == "precious"
@@ -201,7 +201,7 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path, monkeypatch: pyte
     from geomoe3d.clouds import saving
 
     path = tmp_path / "a.npy"
-    monkeypatch.setitem(saving._CLOUD_WRITERS, ".npy", lambda handle, cloud: path.write_text("precious"))
+    monkeypatch.setitem(saving.CLOUD_WRITERS, ".npy", lambda handle, cloud: path.write_text("precious"))
     with pytest.raises(OutputError, match="exists"):
         save_points(path, small_cloud())
     assert path.read_text() == "precious"

@@ -6,16 +6,34 @@ The first step of the pipeline. Reading is O(N); a PLY of N points peaks at abou
 from __future__ import annotations
 
 import difflib
+import gzip
 import os
-from collections.abc import Callable
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from geomoe3d.clouds.formats import arrays, e57, las, meshes, objects, pcd, ply, text
+from geomoe3d.clouds.formats import (  # noqa: F401  each registers its readers and writers
+    arrays,
+    e57,
+    gltf,
+    las,
+    lidar_bin,
+    meshes,
+    objects,
+    pcd,
+    ply,
+    ptx,
+    text,
+    vtk,
+)
 from geomoe3d.clouds.formats.raw import RawCloud
+from geomoe3d.clouds.formats.registry import READERS
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, NonFiniteError
 from geomoe3d.geometry.columns import finite_rows
@@ -24,24 +42,53 @@ from geomoe3d.types import FloatArray, PointCloud
 MAX_COORDINATE = 1e12
 DENSE_MESH_VERTICES = 50_000
 
-_READERS: dict[str, Callable[[Path], RawCloud]] = {
-    ".ply": ply.read_ply,
-    ".pcd": pcd.read_pcd,
-    ".xyz": text.read_text,
-    ".txt": text.read_text,
-    ".csv": text.read_text,
-    ".npy": arrays.read_npy,
-    ".npz": arrays.read_npz,
-    ".obj": meshes.read_mesh,
-    ".stl": meshes.read_mesh,
-    ".off": meshes.read_mesh,
-    ".glb": meshes.read_mesh,
-    ".gltf": meshes.read_mesh,
-    ".las": las.read_las,
-    ".laz": las.read_las,
-    ".e57": e57.read_e57,
+READABLE_SUFFIXES = tuple(READERS)
+_MEANT = {  # what files of other kinds are, and what helps
+    "an archive; unpack it first": (".zip", ".7z", ".rar", ".tar", ".tgz", ".bz2", ".xz", ".zst"),
+    "a scanner maker's project; export it as E57, PTX or LAS": (
+        *(".rcp", ".rcs", ".fls", ".lsproj", ".zfs", ".fws", ".rdbx", ".rxp", ".imp", ".cl3", ".dp", ".tzf"),
+    ),
+    "a recording of a sensor; export single sweeps as PCD or PLY": (".pcap", ".bag", ".db3", ".mcap", ".osf"),
+    "VTK's XML; save it as legacy .vtk or as PLY": (".vtp", ".vtu", ".vti", ".vts", ".vtr", ".vtm"),
+    "a model of another program; export it as OBJ, PLY or GLB": (
+        *(
+            ".dae",
+            ".fbx",
+            ".3ds",
+            ".blend",
+            ".usd",
+            ".usdz",
+            ".usda",
+            ".usdc",
+            ".wrl",
+            ".x3d",
+            ".3mf",
+            ".step",
+        ),
+        *(".stp", ".iges", ".igs", ".ifc", ".dwg", ".dxf", ".skp", ".max", ".rvt"),
+    ),
+    "an image or a raster; turn it into points first": (
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".tif",
+        ".tiff",
+        ".exr",
+        ".dem",
+    ),
+    "pickled Python, which can run anything and is not read; save an array as .npy": (
+        *(".pkl", ".pickle", ".pth", ".pt"),
+    ),
+    "a container of arrays; save the points as .npy": (
+        ".h5",
+        ".hdf5",
+        ".mat",
+        ".parquet",
+        ".feather",
+        ".zarr",
+    ),
+    "a transform or settings; clouds come first": (".json", ".yaml", ".yml", ".tum", ".kitti"),
 }
-READABLE_SUFFIXES = tuple(_READERS)
 
 
 def load_points(
@@ -49,9 +96,10 @@ def load_points(
 ) -> PointCloud:
     """The finite points of ``data`` in local coordinates, file coordinate = points + origin.
 
-    Formats, by suffix in any case: PLY, PCD, XYZ/TXT/CSV, NPY, NPZ, the meshes OBJ, STL, OFF, GLB and GLTF,
-    LAS/LAZ (extra ``geomoe3d[las]``) and E57 (extra ``geomoe3d[e57]``). Columns of text and of NPY files
-    without names follow `formats.raw.split_columns`.
+    Formats, by suffix in any case: PLY, PCD, XYZ/TXT/ASC/CSV, PTS, PTX, NPY, NPZ, VTK, the BIN of KITTI and
+    nuScenes, the meshes OBJ, STL, OFF, GLB and GLTF, LAS/LAZ/COPC (extra ``geomoe3d[las]``) and E57 (extra
+    ``geomoe3d[e57]``), each also behind .gz. Columns of text and of NPY files without names follow
+    `formats.raw.split_columns`. The registry (`formats.registry`) takes readers of your own.
 
     Meshes are sampled evenly over their surface, without normals and colours. The exception is a PLY file
     with faces and at least 50 000 vertices: that is a dense reconstruction, whose vertices are the cloud.
@@ -151,12 +199,16 @@ def read_raw(data: Any) -> RawCloud:
         if path.is_dir():
             raise InputError(f"'{path}' is a directory; pass one file of it")
         size = path.stat().st_size
-        reader = _READERS.get(path.suffix.lower())
+        inner = path.with_suffix("") if path.suffix.lower() == ".gz" else path
+        reader = READERS.get(inner.suffix.lower())
         if reader is None:
-            raise FormatError(unknown_suffix(path, READABLE_SUFFIXES, "readable"))
+            raise FormatError(unknown_suffix(inner, READABLE_SUFFIXES, "readable"))
         if size == 0:
             raise EmptyCloudError(f"'{path}' is an empty file (0 bytes)")
-        return reader(path)
+        if inner is not path:
+            with _unpacked(path) as plain:
+                return _raw(reader(plain))
+        return _raw(reader(path))
     except FileNotFoundError as error:
         if error.filename is not None and Path(error.filename) != path:
             raise FormatError(f"'{path}' refers to a missing file '{error.filename}'") from None
@@ -166,6 +218,35 @@ def read_raw(data: Any) -> RawCloud:
         raise InputError(f"'{path}' may not be read: permission denied; check its owner and mode") from None
     except OSError as error:
         raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
+
+
+def _raw(read: Any) -> RawCloud:
+    """What a reader gives, of the package or of a user's own."""
+    return read if isinstance(read, RawCloud) else objects.raw_from_object(read)
+
+
+@contextmanager
+def _unpacked(path: Path) -> Iterator[Path]:
+    """A temporary copy of a gzip file's content, under its name without .gz; messages name the file itself.
+
+    Raises:
+        FormatError: no gzip file, damaged, or unpacking to more than 200 times its size.
+    """
+    with tempfile.TemporaryDirectory(prefix="geomoe3d-") as folder:
+        plain = Path(folder, path.with_suffix("").name)
+        try:
+            with gzip.open(path) as packed, plain.open("wb") as out:
+                while block := packed.read(1 << 20):
+                    out.write(block)
+                    if out.tell() > max(200 * path.stat().st_size, 1 << 24):
+                        raise FormatError(
+                            f"'{path}' unpacks to more than 200 times its size; unpack it first"
+                        )
+            yield plain
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise FormatError(f"'{path}' is no gzip file or damaged: {error}") from None
+        except InputError as error:
+            raise type(error)(str(error).replace(str(plain), str(path))) from None
 
 
 def _is_path(data: Any) -> bool:
@@ -178,6 +259,9 @@ def unknown_suffix(path: Path, known: tuple[str, ...], verb: str) -> str:
     listed = f"{verb}: {', '.join(known)}"
     if not suffix:
         return f"'{path}' has no suffix to tell its format; {listed}"
+    meant = next((what for what, suffixes in _MEANT.items() if suffix in suffixes), None)
+    if meant is not None and verb == "readable":
+        return f"'{path}' is {meant}; {listed}"
     close = difflib.get_close_matches(suffix, known, n=1, cutoff=0.5)
     nearest = f"did you mean {close[0]}? " if close else ""
     return f"'{path}' has the unknown suffix '{path.suffix}'; {nearest}{listed}"

@@ -9,46 +9,26 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.clouds.formats import arrays, las, meshes, pcd, ply, text
+from geomoe3d.clouds.formats import gltf, las, meshes
 from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.formats.raw import RawCloud
+from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS
 from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
-from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.errors import FormatError, InputError, NonFiniteError
 from geomoe3d.runtime.files import check_output, write_atomically
 from geomoe3d.types import FloatArray
 
-_CLOUD_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
-    ".ply": ply.write_ply,
-    ".pcd": pcd.write_pcd,
-    ".xyz": lambda handle, cloud: text.write_text(handle, cloud, ".xyz"),
-    ".txt": lambda handle, cloud: text.write_text(handle, cloud, ".txt"),
-    ".csv": lambda handle, cloud: text.write_text(handle, cloud, ".csv"),
-    ".npy": arrays.write_npy,
-    ".npz": arrays.write_npz,
-    ".las": lambda handle, cloud: las.write_las(handle, cloud, compressed=False),
-    ".laz": lambda handle, cloud: las.write_las(handle, cloud, compressed=True),
-}
-_MESH_WRITERS: dict[str, Callable[[BinaryIO, RawCloud], None]] = {
-    ".ply": ply.write_ply,
-    ".obj": meshes.write_obj,
-    ".off": meshes.write_off,
-    ".stl": meshes.write_stl,
-}
-_LACKING = {  # what a format cannot hold
-    ".npy": ("normals", "colors"),
-    ".obj": ("normals",),
-    ".off": ("normals", "colors"),
-    ".stl": ("colors",),  # its normals are those of the triangles
-}
-WRITABLE_SUFFIXES = tuple(_CLOUD_WRITERS)
-WRITABLE_MESH_SUFFIXES = (*_MESH_WRITERS, ".glb")
+WRITABLE_SUFFIXES = tuple(CLOUD_WRITERS)
+WRITABLE_MESH_SUFFIXES = (*MESH_WRITERS, ".glb")
 
 
 def check_cloud_output(path: str | os.PathLike[str], force: bool, suffixes: tuple[str, ...]) -> Path:
@@ -71,7 +51,7 @@ def check_cloud_output(path: str | os.PathLike[str], force: bool, suffixes: tupl
     return check_output(path, force=force)
 
 
-def _write(path: Path, fill: Callable[[BinaryIO], None], force: bool) -> None:
+def _write(path: Path, fill: Callable[[BinaryIO], object], force: bool) -> None:
     """Let ``fill`` write a binary file that takes the name ``path`` only when it is whole."""
 
     def write(temporary: Path) -> None:
@@ -131,70 +111,139 @@ def save_points(
         )
     if path.suffix.lower() == ".npy" and (normals is not None or colors is not None):
         raise FormatError(f"'{path}': NPY holds points only; choose .npz or .ply for normals and colours")
-    _write(path, lambda handle: _CLOUD_WRITERS[path.suffix.lower()](handle, cloud), force)
+    _write(path, lambda handle: CLOUD_WRITERS[path.suffix.lower()](handle, cloud), force)
+
+
+def check_aligned(
+    path: str | os.PathLike[str], source: Any, *, precision: str = "auto", force: bool = False
+) -> Path:
+    """Find out before work begins whether `save_aligned` could write ``path``, as far as that can be known.
+
+    A source is looked into only where ``path`` can hold nothing but a mesh.
+
+    Raises:
+        FormatError: a suffix that cannot be written, a mesh suffix for a cloud, or a precision that the
+            format does not know.
+        DependencyError: what the format needs is not installed.
+        OutputError, InputError: as `save_aligned`.
+    """
+    both = tuple(dict.fromkeys(WRITABLE_SUFFIXES + WRITABLE_MESH_SUFFIXES))
+    path = check_cloud_output(path, force, both)
+    suffix = path.suffix.lower()
+    if precision not in PRECISIONS:
+        raise FormatError(f"unknown precision '{precision}'; known: {', '.join(PRECISIONS)}")
+    if precision != "auto" and suffix not in _WITH_PRECISION:
+        raise FormatError(
+            f"'{path}': a precision can be chosen for {', '.join(_WITH_PRECISION)}; "
+            f"{suffix} keeps what it can by itself"
+        )
+    if suffix in (".las", ".laz"):
+        las.require_laspy(suffix == ".laz")
+    if suffix not in WRITABLE_SUFFIXES and read_raw(source).faces is None:
+        raise FormatError(
+            f"'{path}': {suffix} holds meshes, but {describe(source)} is a cloud; writable: "
+            + ", ".join(WRITABLE_SUFFIXES)
+        )
+    return path
 
 
 def save_aligned(
-    path: str | os.PathLike[str], source: Any, T_target_source: ArrayLike, *, force: bool = False
+    path: str | os.PathLike[str],
+    source: Any,
+    T_target_source: ArrayLike,
+    *,
+    precision: str = "auto",
+    force: bool = False,
+    remark: Callable[[str], None] = lambda sentence: None,
 ) -> tuple[str, ...]:
     """Write the source at full resolution in the target's file coordinates: p_target = R p_source + t.
 
-    All finite points are moved, with their normals (turned) and colours; other attributes of the file are
-    not carried over, NPY holds the points only, and what is lost is returned by name. A mesh written to PLY,
-    OBJ, OFF, STL or GLB stays a mesh: its triangles are moved, GLB keeps materials, PLY normals and colours,
-    OBJ colours. A mesh written to another suffix becomes the points that `load_points` takes from it.
+    All finite points are moved, with their normals (turned), colours and fields, as far as the format holds
+    them; what is lost is returned by name. Where more than one point lies at exactly (0, 0, 0), those mark
+    missing measurements and stay there. A mesh written to PLY, OBJ, OFF, STL or GLB stays a mesh: its
+    triangles are moved. OBJ to OBJ and GLB or GLTF to GLB keep everything else as it is in the file; other
+    meshes written to GLB keep their materials. A mesh written to another suffix becomes the points that
+    `load_points` takes from it.
 
     Args:
         path: a suffix of `save_points`, or for meshes .obj, .off, .stl or .glb.
         source: anything `load_points` takes.
         T_target_source: (4, 4) rigid motion in file coordinates.
+        precision: of coordinates in PLY and PCD. "auto" writes floats, which every program reads, where they
+            move nothing by more than 1e-6 of the spread, and all digits elsewhere; "double" always writes all
+            digits; "single" always writes floats, of coordinates far from zero minus an origin, which is
+            stated in the header.
         force: replace an existing file, which may be the source itself.
+        remark: called with sentences on how the file can be read.
 
     Returns:
         Names of what the source says of its points and the written file does not.
 
     Raises:
         InputError: no rigid motion, or a source that cannot be used (as `load_points`).
-        FormatError: a suffix that cannot be written, or a mesh suffix for a cloud.
+        FormatError: as `check_aligned`.
         OutputError: as `check_cloud_output`, or the disk refuses.
     """
     T = _rigid(T_target_source)
-    both = tuple(dict.fromkeys(WRITABLE_SUFFIXES + WRITABLE_MESH_SUFFIXES))
-    path = check_cloud_output(path, force, both)
+    path = check_aligned(path, source, precision=precision, force=force)
     suffix = path.suffix.lower()
+    file = Path(source) if isinstance(source, (str, os.PathLike)) else None
+    kind = "" if file is None else file.suffix.lower()
+    if (file is not None and suffix == ".obj" and kind == ".obj") or (
+        file is not None and suffix == ".glb" and kind in (".glb", ".gltf")
+    ):
+        read_raw(file)  # refuses what is damaged
+        whole = gltf.moved_glb(file, T) if suffix == ".glb" else meshes.moved_obj(file, T, path)
+        _write(path, lambda handle: handle.write(whole), force)
+        return ()
     what = describe(source)
     raw, _ = finite_part(read_raw(source), what)
     as_mesh = raw.faces is not None and suffix in WRITABLE_MESH_SUFFIXES
-    if not as_mesh and suffix not in WRITABLE_SUFFIXES:
-        raise FormatError(
-            f"'{path}': {suffix} holds meshes, but {what} is a cloud; writable: "
-            + ", ".join(WRITABLE_SUFFIXES)
-        )
-    if not as_mesh and is_sampled(source, raw):
-        raw = RawCloud(meshes.sample_surface(raw, 100_000, 0, what))
-
-    def fill(handle: BinaryIO) -> None:
-        if as_mesh and suffix == ".glb":
-            meshes.write_glb(handle, meshes.scene_of(source, raw), T)
-        elif as_mesh:
-            _MESH_WRITERS[suffix](handle, _moved(raw, T))
-        else:
-            cloud = _moved(raw, T)
-            _CLOUD_WRITERS[suffix](handle, RawCloud(cloud.points, cloud.normals, cloud.colors))
-
-    _write(path, fill, force)
+    lost = list(raw.unread)
+    if not as_mesh and raw.faces is not None:
+        sampled = is_sampled(source, raw)
+        lost += [*(n for n in ("normals", "colors") if getattr(raw, n) is not None), *raw.fields] * sampled
+        lost.append("faces")
+        raw = RawCloud(meshes.sample_surface(raw, 100_000, 0, what)) if sampled else replace(raw, faces=None)
     if as_mesh and suffix == ".glb":
-        return ()
-    lacking = [name for name in _LACKING.get(suffix, ()) if getattr(raw, name) is not None]
-    return (*raw.unread, *lacking)
+        _write(path, lambda handle: meshes.write_glb(handle, meshes.scene_of(source, raw), T), force)
+        kept = ("texture coordinates", "materials")
+        return tuple(
+            n for n in (*lost, *(["normals"] * (raw.normals is not None)), *raw.fields) if n not in kept
+        )
+    moved = _moved(raw, T)
+    write = (MESH_WRITERS if as_mesh else CLOUD_WRITERS)[suffix]
+    if suffix in _WITH_PRECISION:
+        single = precision == "single" or (precision == "auto" and fits_single_precision(moved.points))
+        origin = choose_origin(moved.points) if precision == "single" else np.zeros(3)
+        note = ""
+        if origin.any():
+            note = "origin " + " ".join(f"{value:.17g}" for value in origin)
+            moved = replace(moved, points=moved.points - origin)
+            remark(f"{path} holds floats about the {note}, which was taken off every point")
+        elif not single:
+            remark(_WITH_PRECISION[suffix].format(path=path))
+        write = partial(write, single=single, note=note)
+    _write(path, lambda handle: lost.extend(write(handle, moved)), force)
+    return tuple(dict.fromkeys(lost))
+
+
+PRECISIONS = ("auto", "double", "single")
+_WITH_PRECISION = {  # and who cannot read all digits
+    ".ply": "{path} holds doubles: the Point Cloud Library and small_gicp read them as an empty cloud "
+    "(--aligned-precision single writes floats)",
+    ".pcd": "{path} holds all digits as text: the Point Cloud Library and programs built on it round them to "
+    "floats (--aligned-precision single writes floats about an origin)",
+}
 
 
 def _moved(raw: RawCloud, T: FloatArray) -> RawCloud:
-    """R p + t, computed about the cloud's own origin so that far coordinates keep their last digits."""
-    R, t = T[:3, :3], T[:3, 3]
-    origin = choose_origin(raw.points)
-    points = (raw.points - origin) @ R.T + (R @ origin + t)
-    return RawCloud(points, None if raw.normals is None else raw.normals @ R.T, raw.colors, raw.faces)
+    """Points moved and normals turned; (0, 0, 0) stays where it marks missing measurements."""
+    points = meshes.move_points(raw.points, T)
+    at_zero = ~raw.points.any(axis=1)
+    if raw.faces is None and np.count_nonzero(at_zero) > 1:
+        points[at_zero] = 0.0
+    return replace(raw, points=points, normals=None if raw.normals is None else raw.normals @ T[:3, :3].T)
 
 
 def _rigid(T: ArrayLike) -> FloatArray:

@@ -28,7 +28,7 @@ POSES_FILE, PAGE_FILE = "poses.json", "page.html"
 PAGE_MARK = '<meta name="generator" content="geomoe3d multiway">'
 _FORMAT, _KIND = "geomoe3d scene 1", "geomoe3d scene "
 _GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|g2o|ply)")
-_OFTEN_NO_CLOUDS = {".txt", ".csv", ".npy", ".npz"}
+_OFTEN_NO_CLOUDS = {".txt", ".csv", ".asc", ".bin", ".npy", ".npz"}
 
 
 @dataclass(frozen=True)

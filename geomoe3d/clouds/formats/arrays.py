@@ -9,8 +9,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.clouds.formats.raw import RawCloud, scale_colors, split_columns
-from geomoe3d.errors import FormatError
+from geomoe3d.clouds.formats.raw import RawCloud, cloud_of, columns_by_name, scale_colors, split_columns
+from geomoe3d.clouds.formats.registry import reader, writer
+from geomoe3d.errors import FormatError, InputError
 from geomoe3d.types import FloatArray
 
 _POINT_KEYS = (
@@ -22,8 +23,9 @@ _COLOR_KEYS = ("colors", "color", "colours", "colour", "rgb")
 _PICKLED = "holds pickled Python objects, which are not loaded; save a plain float array of shape (N, 3)"
 
 
+@reader(".npy")
 def read_npy(path: Path) -> RawCloud:
-    """(N, 3) numbers, or (N, 6) and (N, 9) by the rule of `split_columns`.
+    """(N, C) numbers by the rule of `split_columns`, or anything else that `table_cloud` takes.
 
     Raises:
         FormatError: no NPY file, truncated, pickled, or of another shape or type.
@@ -43,11 +45,14 @@ def read_npy(path: Path) -> RawCloud:
         raise FormatError(
             f"'{path}' is {path.stat().st_size} bytes long, its header describes {place}; its header is wrong"
         )
-    return split_columns(_table(array, f"'{path}'"), None)
+    return table_cloud(array, f"'{path}'")
 
 
+@reader(".npz")
 def read_npz(path: Path) -> RawCloud:
     """Points under a usual key (points, xyz, pcd, pos ...) or as the only array, with normals and colors.
+
+    Other arrays (N,) of numbers are fields.
 
     Raises:
         FormatError: no NPZ file, truncated, pickled, no points (the message lists the keys), or normals or
@@ -68,14 +73,21 @@ def read_npz(path: Path) -> RawCloud:
                     f"keys known: {', '.join(_POINT_KEYS)}"
                 )
             arrays = [None if key is None else archive[key] for key in wanted]
-            unread = tuple(key for key in archive.files if key not in wanted)
+            others = {key: archive[key] for key in archive.files if key not in wanted}
     except (FormatError, MemoryError, OSError):
         raise
     except Exception as error:  # zipfile and zlib have many ways to refuse
         raise FormatError(f"'{path}' {_numpy_reason(error)}") from None
     points, normals, colors = arrays
     assert points is not None
-    cloud = split_columns(_table(points, f"'{path}' key '{wanted[0]}'"), None)
+    cloud = table_cloud(points, f"'{path}' key '{wanted[0]}'")
+    fields = dict(cloud.fields)
+    unread = list(cloud.unread)
+    for key, values in others.items():
+        if values.shape == (len(cloud.points),) and values.dtype.kind in "fiu" and key not in fields:
+            fields[key] = values
+        else:
+            unread.append(key)
     for key, extra in zip(wanted[1:], (normals, colors), strict=True):
         if extra is not None and (extra.shape != (len(cloud.points), 3) or extra.dtype.kind not in "fiu"):
             raise FormatError(
@@ -86,7 +98,8 @@ def read_npz(path: Path) -> RawCloud:
         cloud.points,
         cloud.normals if normals is None else np.asarray(normals, dtype=np.float64),
         cloud.colors if colors is None else scale_colors(colors),
-        unread=(*cloud.unread, *unread),
+        fields=fields,
+        unread=tuple(unread),
     )
 
 
@@ -102,21 +115,89 @@ def _numpy_reason(error: BaseException) -> str:
     return f"is no numpy file or truncated ({text})"
 
 
-def _table(array: NDArray[Any], what: str) -> FloatArray:
-    """Numbers (N, C >= 3) of a file as float64."""
+def table_cloud(
+    array: NDArray[Any], what: str, columns: bool = True, error: type[InputError] = FormatError
+) -> RawCloud:
+    """An array as a cloud: (N, 3), organised (H, W, 3), or structured with fields x, y, z.
+
+    Args:
+        array: of a file, or given in memory.
+        what: its name in messages.
+        columns: whether (N, C) with more columns is taken too, by the rule of `split_columns`.
+        error: what is raised.
+
+    Raises:
+        InputError: another shape or type; also (3, N), which is more likely a cloud that lies on its side.
+    """
+    if array.dtype.names is not None:
+        return _structured(array.ravel(), what, error)
     if array.dtype.kind not in "fiu":
-        raise FormatError(f"{what} holds {array.dtype}, expected floats or integers")
-    if array.ndim != 2 or array.shape[1] < 3:
-        raise FormatError(f"{what} has shape {array.shape}, expected (N, 3), (N, 6) or (N, 9)")
-    return np.ascontiguousarray(array, dtype=np.float64)
+        raise error(
+            f"{what} holds {array.dtype}, expected floats or integers; convert with "
+            "numpy.asarray(points, dtype=float) if they are real numbers"
+        )
+    grid: tuple[str, ...] = ()
+    if array.ndim == 3 and array.shape[2] == 3:
+        grid = (f"grid of {array.shape[1]} x {array.shape[0]}",)
+        array = array.reshape(-1, 3)
+    fits = array.ndim == 2 and (array.shape[1] == 3 or (columns and array.shape[1] > 3))
+    if not fits or (array.shape[0] == 3 and array.shape[1] > 3):
+        wanted = "(N, 3), (H, W, 3) or more columns behind x, y and z" if columns else "(N, 3) or (H, W, 3)"
+        raise error(f"{what} has shape {array.shape}, expected {wanted}{_shape_hint(array)}")
+    table: FloatArray = np.array(array, dtype=np.float64, order="C")
+    return RawCloud(table, unread=grid) if array.shape[1] == 3 else split_columns(table, None, what)
 
 
-def write_npy(handle: BinaryIO, cloud: RawCloud) -> None:
-    """The coordinates alone, float64: NPY has no place to name normals and colours."""
+def _shape_hint(array: NDArray[Any]) -> str:
+    if array.shape == (3,):
+        return "; a single point is points[None]"
+    if array.ndim == 2 and array.shape[0] == 3:
+        return "; pass points.T if each column is a point"
+    if array.ndim == 2 and array.shape[1] > 3:
+        return (
+            "; pass points[:, :3] for the coordinates alone, or an .npz file or a geomoe3d.types.PointCloud "
+            "to keep normals and colours"
+        )
+    return ""
+
+
+def _structured(rows: NDArray[Any], what: str, error: type[InputError]) -> RawCloud:
+    """Columns by the names of fields; a field of three numbers such as xyz or normal counts as three."""
+    names: list[str] = []
+    columns: list[NDArray[Any]] = []
+    unread: list[str] = []
+    triples = {
+        **dict.fromkeys(_POINT_KEYS, ("x", "y", "z")),
+        **dict.fromkeys(_NORMAL_KEYS, ("nx", "ny", "nz")),
+        **dict.fromkeys(_COLOR_KEYS, ("red", "green", "blue")),
+    }
+    for name in rows.dtype.names or ():
+        values = rows[name]
+        if values.dtype.kind in "fiu" and values.shape[1:] == (3,) and name.lower() in triples:
+            names += triples[name.lower()]
+            columns += list(values.T)
+        elif values.dtype.kind in "fiu" and values.ndim == 1:
+            names.append(name)
+            columns.append(values)
+        else:
+            unread.append(name)
+    if "points" not in columns_by_name(names):
+        raise error(f"{what} has the fields {', '.join(rows.dtype.names or ())}; x, y and z are needed")
+    return cloud_of(names, columns, unread=tuple(unread))
+
+
+@writer(".npy")
+def write_npy(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
+    """The coordinates alone, float64: NPY has no place to name normals, colours and fields."""
     np.save(handle, cloud.points, allow_pickle=False)
+    return (*(name for name in ("normals", "colors") if getattr(cloud, name) is not None), *cloud.fields)
 
 
-def write_npz(handle: BinaryIO, cloud: RawCloud) -> None:
-    """Float64 arrays points, normals and colors, uncompressed."""
+@writer(".npz")
+def write_npz(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
+    """Arrays points, normals, colors (float64) and the fields by their names, uncompressed."""
     arrays = {"points": cloud.points, "normals": cloud.normals, "colors": cloud.colors}
-    np.savez(handle, **{key: array for key, array in arrays.items() if array is not None})  # type: ignore[arg-type]
+    named = {key: array for key, array in arrays.items() if array is not None}
+    kept = {key: values for key, values in cloud.fields.items() if key not in (*arrays, "file")}
+    np.savez(handle, **named, **kept)  # type: ignore[arg-type]
+    return tuple(key for key in cloud.fields if key not in kept)

@@ -13,18 +13,22 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
+from geomoe3d.clouds.formats.registry import reader
 from geomoe3d.errors import DependencyError, FormatError
 from geomoe3d.types import FloatArray
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
+_NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 
 
+@reader(".e57")
 def read_e57(path: Path) -> RawCloud:
     """Points of all scans, each moved by its pose; points that the file marks invalid are left out.
 
-    Colours are kept when every scan has them.
+    Colours, normals and fields such as intensity are kept when every scan has them, and named where only some
+    have.
 
     Raises:
         FormatError: no E57 file, truncated, or damaged.
@@ -46,10 +50,23 @@ def read_e57(path: Path) -> RawCloud:
     scans = [scan for scan in scans if len(scan.points)]
     if not scans:
         return RawCloud(np.empty((0, 3)))
-    colors = [scan.colors for scan in scans if scan.colors is not None]
+    unread: list[str] = []
+
+    def together(name: str, parts: list[Any]) -> Any:
+        """One array of all scans, or None where a scan lacks it."""
+        held = [part for part in parts if part is not None]
+        if held and len(held) < len(parts):
+            unread.append(f"{name} of some scans")
+        return np.concatenate(held) if held and len(held) == len(parts) else None
+
+    names = dict.fromkeys(name for scan in scans for name in scan.fields)
+    fields = {name: together(name, [scan.fields.get(name) for scan in scans]) for name in names}
     return RawCloud(
         np.concatenate([scan.points for scan in scans]),
-        colors=np.concatenate(colors) if len(colors) == len(scans) else None,
+        together("normals", [scan.normals for scan in scans]),
+        together("colors", [scan.colors for scan in scans]),
+        fields={name: values for name, values in fields.items() if values is not None},
+        unread=(*dict.fromkeys(name for scan in scans for name in scan.unread), *unread),
     )
 
 
@@ -75,8 +92,8 @@ def _read_scan(libe57: Any, file: Any, index: int) -> RawCloud:
             f"'{file.path}': scan {index} has no coordinates, only: {', '.join(sorted(present))}"
         )
     state = "cartesianInvalidState" if axes is _CARTESIAN else "sphericalInvalidState"
-    wanted = [*axes, *(_COLORS if set(_COLORS) <= present else ()), *([state] if state in present else [])]
-    data = {name: np.empty(count) for name in wanted}
+    numeric = {name for name in present if isinstance(_prototype(libe57, header, name), _numbers(libe57))}
+    data = {name: np.empty(count) for name in header.point_fields if name in numeric}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in data.items():
         # The two flags: convert any stored type to double, and apply the scale of scaled integers.
@@ -89,11 +106,26 @@ def _read_scan(libe57: Any, file: Any, index: int) -> RawCloud:
         points = _cartesian(points)
     rotation, translation = _pose(header.node)
     points = points @ rotation.T + translation
-    cloud = RawCloud(points)
-    if _COLORS[0] in data:
-        colors = np.stack([data[name] for name in _COLORS], axis=1)
-        cloud = RawCloud(points, colors=_scaled_colors(header.node, colors))
+    colors = normals = None
+    used = {*axes, state}
+    if set(_COLORS) <= data.keys():
+        colors = _scaled_colors(header.node, np.stack([data[name] for name in _COLORS], axis=1))
+        used |= set() if colors is None else {*_COLORS, "isColorInvalid"}
+    if set(_NORMALS) <= data.keys():
+        normals = np.stack([data[name] for name in _NORMALS], axis=1) @ rotation.T
+        used |= set(_NORMALS)
+    fields = {name: values for name, values in data.items() if name not in used and values.any()}
+    cloud = RawCloud(points, normals, colors, fields=fields, unread=tuple(sorted(present - numeric)))
     return cloud.take(data[state] == 0) if state in data else cloud
+
+
+def _prototype(libe57: Any, header: Any, name: str) -> Any:
+    """The node that describes a field of a scan's points."""
+    return libe57.StructureNode(header.points.prototype())[name]
+
+
+def _numbers(libe57: Any) -> tuple[type, ...]:
+    return (libe57.IntegerNode, libe57.ScaledIntegerNode, libe57.FloatNode)
 
 
 def _cartesian(spherical: FloatArray) -> FloatArray:

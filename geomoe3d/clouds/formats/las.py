@@ -8,14 +8,21 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors
+from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors, wrong_count
+from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import DependencyError, FormatError
 
 _LARGEST = 2_000_000_000  # of the signed 32 bit integers that LAS stores, with a margin
 
 
-def _laspy(compressed: bool) -> Any:
+def require_laspy(compressed: bool) -> Any:
+    """The module laspy, able to read and write LAZ if ``compressed``.
+
+    Raises:
+        DependencyError: it is not installed.
+    """
     try:
         import laspy
     except ImportError:
@@ -27,17 +34,20 @@ def _laspy(compressed: bool) -> Any:
     return laspy
 
 
+@reader(".las", ".laz")
 def read_las(path: Path) -> RawCloud:
     """Coordinates X * scale + offset in float64, with colours, and normals if extra dimensions name them.
 
     Colours are 16 bit by the standard; a file whose largest value fits 8 bits is taken as 8 bit, and one
-    with nothing but zeros as having none.
+    with nothing but zeros as having none. The other dimensions are fields, unless all are zero: each format
+    has them all. COPC is read as the LAZ that it is, every level. Points beyond the header's count are left
+    out, as PDAL does.
 
     Raises:
         FormatError: no LAS file, damaged, or a count in the header that the content does not bear out.
         DependencyError: laspy (or lazrs for LAZ) is absent.
     """
-    laspy = _laspy(path.suffix.lower() == ".laz")
+    laspy = require_laspy(path.suffix.lower() == ".laz")
     _check_records(path)
     try:
         with laspy.open(path) as reader:
@@ -52,7 +62,7 @@ def read_las(path: Path) -> RawCloud:
         raise FormatError(f"'{path}' is no LAS file or damaged: {error}") from None
     num_points = len(las.points)
     if num_points != header.point_count:
-        raise _wrong_count(path, header.point_count, num_points)
+        raise wrong_count(path, header.point_count, num_points)
     points = np.empty((num_points, 3))
     for k, axis in enumerate((las.x, las.y, las.z)):
         points[:, k] = axis
@@ -65,13 +75,16 @@ def read_las(path: Path) -> RawCloud:
     if "normals" in groups:
         normals = np.stack([np.asarray(las[names[k]], dtype=np.float64) for k in groups["normals"]], axis=1)
     read = {"X", "Y", "Z", "red", "green", "blue", *(names[k] for k in groups.get("normals", ()))}
-    others = [name for name in names if name not in read]  # each format has them all; zeros say nothing
-    return RawCloud(points, normals, colors, unread=tuple(n for n in others if np.asarray(las[n]).any()))
-
-
-def _wrong_count(path: Path, said: int, held: int) -> FormatError:
-    reason = "it is truncated or its header is wrong" if held < said else "its header is wrong"
-    return FormatError(f"'{path}': the header says {said} points, the file holds {held}; {reason}")
+    fields: dict[str, NDArray[Any]] = {}
+    unread = []
+    for name in names:
+        values = np.asarray(las[name])
+        if name not in read and values.any():
+            if values.ndim == 1:
+                fields[name] = values
+            else:
+                unread.append(name)
+    return RawCloud(points, normals, colors, fields=fields, unread=tuple(unread))
 
 
 def _check_records(path: Path) -> None:
@@ -105,11 +118,8 @@ def _check_size(path: Path, header: Any) -> None:
         _check_chunk_table(path, header, size)
         return
     held = (size - header.offset_to_point_data) // header.point_format.size
-    followed = getattr(header, "number_of_evlrs", 0) or getattr(
-        header, "start_of_waveform_data_packet_record", 0
-    )
-    if held < header.point_count or (held > header.point_count and not followed):
-        raise _wrong_count(path, header.point_count, max(held, 0))
+    if held < header.point_count:
+        raise wrong_count(path, header.point_count, max(held, 0))
 
 
 def _check_chunk_table(path: Path, header: Any, size: int) -> None:
@@ -141,29 +151,96 @@ def _check_chunk_table(path: Path, header: Any, size: int) -> None:
         )
 
 
-def write_las(handle: BinaryIO, cloud: RawCloud, compressed: bool) -> None:
-    """LAS 1.2 or LAZ; coordinates on a grid of a power of ten that is at most 1e-8 of the cloud's extent.
+_STANDARD = {  # the point formats in use, by what they hold besides intensity, returns and classes
+    0: (),
+    1: ("gps_time",),
+    2: ("red",),
+    3: ("gps_time", "red"),
+    6: ("gps_time", "scanner_channel", "overlap"),
+    7: ("gps_time", "scanner_channel", "overlap", "red"),
+    8: ("gps_time", "scanner_channel", "overlap", "red", "nir"),
+}
+
+
+@writer(".las")
+def write_las(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
+    """LAS 1.2 or 1.4; coordinates on a grid of a power of ten that is at most 1e-8 of the cloud's extent.
 
     LAS stores 32 bit integers times a scale. The scale is the finest power of ten that spans the cloud (1e-7
-    for 100 units), so a coordinate moves by at most half of it. Colours are 16 bit, normals extra dimensions.
+    for 100 units), so a coordinate moves by at most half of it. Colours are 16 bit. Fields go where LAS has a
+    place of that name that holds their values, else, like normals, into extra dimensions.
     """
-    laspy = _laspy(compressed)
-    header = laspy.LasHeader(point_format=2 if cloud.colors is not None else 0, version="1.2")
+    return _write(handle, cloud, False)
+
+
+@writer(".laz")
+def write_laz(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
+    """As `write_las`, compressed."""
+    return _write(handle, cloud, True)
+
+
+def _write(handle: BinaryIO, cloud: RawCloud, compressed: bool) -> tuple[str, ...]:
+    laspy = require_laspy(compressed)
+    wanted = {name for name in cloud.fields if any(name in held for held in _STANDARD.values())}
+    wanted |= {"red"} if cloud.colors is not None else set()
+    wanted |= {"overlap"} if "scan_angle" in cloud.fields or _beyond(cloud, "classification", 31) else set()
+    number = next((k for k, held in _STANDARD.items() if wanted <= set(held)), 8)
+    header = laspy.LasHeader(point_format=number, version="1.2" if number < 6 else "1.4")
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     offset = np.floor((low + high) / 2.0)
     reach = max(float(np.abs(high - offset).max()), float(np.abs(low - offset).max()), 1e-3)
     header.offsets = offset
     header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST)))
-    if cloud.normals is not None:
-        header.add_extra_dims([laspy.ExtraBytesParams(name=f"normal_{axis}", type="f8") for axis in "xyz"])
+    standard = {d.name: d for d in header.point_format.dimensions}
+    extra = (
+        {}
+        if cloud.normals is None
+        else {f"normal_{a}": n for a, n in zip("xyz", cloud.normals.T, strict=True)}
+    )
+    lost = []
+    plain: dict[str, NDArray[Any]] = {}
+    for name, values in cloud.fields.items():
+        if name in standard and name not in ("X", "Y", "Z", "red", "green", "blue"):
+            if _fits(standard[name], values):
+                plain[name] = values
+            else:
+                extra[f"{name}_{values.dtype.name}"] = values
+                lost.append(
+                    f"{name} (kept as {name}_{values.dtype.name}; the place that LAS has cannot hold it)"
+                )
+        elif (
+            name.lower() in ("x", "y", "z", "red", "green", "blue")
+            or len(name.encode()) > 32
+            or name in extra
+        ):
+            lost.append(name)
+        else:
+            extra[name] = values.astype(np.float32) if values.dtype == np.float16 else values
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name=name, type=values.dtype.str[1:]) for name, values in extra.items()]
+    )
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud.points.T
-    if cloud.normals is not None:
-        for k, axis in enumerate("xyz"):
-            las[f"normal_{axis}"] = cloud.normals[:, k]
+    for name, values in {**plain, **extra}.items():
+        las[name] = values
     if cloud.colors is not None:
         stored = np.rint(cloud.colors * 65535.0)
         if stored.max() <= 255:  # readers, this one too, would take them for 8 bit values
             stored = np.rint(cloud.colors * 255.0) * 257.0
         las.red, las.green, las.blue = stored.astype(np.uint16).T
     las.write(handle, do_compress=compressed)
+    return tuple(lost)
+
+
+def _beyond(cloud: RawCloud, name: str, limit: float) -> bool:
+    return name in cloud.fields and bool((cloud.fields[name] > limit).any())
+
+
+def _fits(dimension: Any, values: NDArray[Any]) -> bool:
+    """Whether a dimension of LAS holds the values (N,) exactly."""
+    if dimension.kind.name == "FloatingPoint":
+        return values.dtype.kind == "f" or bool((values.astype(np.float64) == values).all())
+    low, high = (dimension.min, dimension.max)
+    with np.errstate(invalid="ignore"):
+        whole = values.dtype.kind in "iu" or bool((values == np.rint(values)).all())
+    return whole and bool((values >= low).all() and (values <= high).all())

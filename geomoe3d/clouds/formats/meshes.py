@@ -1,11 +1,12 @@
-"""Meshes: OBJ, STL, OFF, GLB and GLTF through trimesh, surface sampling, and writing a moved mesh.
+"""Meshes: OBJ, STL and OFF through trimesh, surface sampling, and writing a moved mesh.
 
-Sampling M points on F faces is O(F + M log F). Counts that STL, OFF and GLB state are held against the file
+Sampling M points on F faces is O(F + M log F). Counts that STL and OFF state are held against the file
 first; OBJ states none, so a truncated OBJ can only be noticed when a face names a missing vertex.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import struct
@@ -18,6 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
+from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.clouds.formats.text import write_rows
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError
@@ -32,12 +34,14 @@ def load_scene(path: Path) -> Any:
         FormatError: trimesh refuses the file, or a stated count or length is not borne out.
     """
     suffix = path.suffix.lower()
-    check = {".stl": _check_stl, ".off": _check_off, ".glb": _check_glb}.get(suffix)
-    if check is not None:
-        check(path)
+    size = _stl_size(path) if suffix == ".stl" else None
+    if suffix == ".off":
+        _check_off(path)
     import trimesh
 
     with _as_format_errors(path):
+        if size is not None:  # trimesh refuses bytes behind the faces, which CAD programs leave
+            return trimesh.load(io.BytesIO(path.read_bytes()[:size]), file_type="stl", process=False)
         return trimesh.load(str(path), process=False)
 
 
@@ -58,29 +62,45 @@ def _as_format_errors(path: Path) -> Iterator[None]:
         log.setLevel(level)
 
 
+_OBJ_WORDS = {"vt": "texture coordinates", "vn": "normals", "usemtl": "materials", "l": "lines"}
+
+
+@reader(".obj", ".stl", ".off")
 def read_mesh(path: Path) -> RawCloud:
-    """All geometry of a mesh file in one frame, transforms of the scene graph applied."""
+    """All geometry of a mesh file in one frame.
+
+    Raises:
+        FormatError: as `load_scene`.
+        EmptyCloudError: no geometry.
+    """
     scene = load_scene(path)
     with _as_format_errors(path):
-        return flatten(scene, f"'{path}'")
+        mesh = flatten(scene, f"'{path}'")
+    if path.suffix.lower() != ".obj":
+        return mesh
+    with path.open(encoding="latin-1") as handle:
+        words = {line.split(None, 1)[0] for line in handle if line.strip()}
+    return replace(mesh, unread=tuple(name for word, name in _OBJ_WORDS.items() if word in words))
 
 
-def _check_stl(path: Path) -> None:
+def _stl_size(path: Path) -> int | None:
+    """Bytes of a binary STL up to its last face; None for ASCII."""
     size = path.stat().st_size
     with path.open("rb") as handle:
         head = handle.read(84)
         said = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else -1
-        if size == 84 + 50 * said:
-            return
-        if head.lstrip().startswith(b"solid"):
+        if head.lstrip().startswith(b"solid") and size != 84 + 50 * said:
             handle.seek(max(0, size - 200))
             if b"endsolid" not in handle.read():
                 raise FormatError(f"'{path}' is truncated: an ASCII STL ends with 'endsolid'")
-            return
+            return None
     held = max(0, size - 84) // 50
-    raise FormatError(
-        f"'{path}': the header says {max(said, 0)} faces, the file holds {held}; it is truncated or no STL"
-    )
+    if said < 0 or held < said:
+        raise FormatError(
+            f"'{path}': the header says {max(said, 0)} faces, the file holds {held}; "
+            "it is truncated or no STL"
+        )
+    return 84 + 50 * int(said)
 
 
 def _check_off(path: Path) -> None:
@@ -99,16 +119,6 @@ def _check_off(path: Path) -> None:
             f"'{path}': the header says {counts[0]} vertices and {counts[1]} faces, that is {said} lines; "
             f"the file holds {held}; it is truncated or its header is wrong"
         )
-
-
-def _check_glb(path: Path) -> None:
-    with path.open("rb") as handle:
-        head = handle.read(12)
-    if len(head) < 12 or head[:4] != b"glTF":
-        raise FormatError(f"'{path}' is no GLB file: it does not start with 'glTF'")
-    said, held = struct.unpack("<I", head[8:12])[0], path.stat().st_size
-    if said > held:
-        raise FormatError(f"'{path}': the header says {said} bytes, the file holds {held}; it is truncated")
 
 
 def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
@@ -197,18 +207,67 @@ def sample_surface(mesh: RawCloud, num_points: int, seed: int, what: str) -> Flo
     return np.asarray(points, dtype=np.float64) + origin
 
 
-def write_obj(handle: BinaryIO, mesh: RawCloud) -> None:
+def _lost(mesh: RawCloud, *names: str) -> tuple[str, ...]:
+    """Which of normals and colours there are to lose, and the fields."""
+    return (*(name for name in names if getattr(mesh, name) is not None), *mesh.fields)
+
+
+@writer(".obj", mesh=True)
+def write_obj(handle: BinaryIO, mesh: RawCloud) -> tuple[str, ...]:
     """Wavefront OBJ: vertices in full precision, with colours behind the coordinates, and triangles."""
     parts = [mesh.points] if mesh.colors is None else [mesh.points, mesh.colors]
     write_rows(handle, parts, prefix="v ")
     _write_faces(handle, mesh, "f ", 1)
+    return _lost(mesh, "normals")
 
 
-def write_off(handle: BinaryIO, mesh: RawCloud) -> None:
+def moved_obj(path: Path, T: FloatArray, to: Path) -> bytes:
+    """A Wavefront OBJ with its vertices and normals under a motion (4, 4) and every other line as it is.
+
+    Args:
+        path: the file.
+        T: p_target = R p_source + t.
+        to: where it will be written; the names of material files are made relative to that.
+
+    Raises:
+        FormatError: a vertex or a normal is no row of numbers.
+    """
+    lines = path.read_text(encoding="latin-1").split("\n")
+    for word in ("v", "vn"):
+        rows = [k for k, line in enumerate(lines) if line.split(None, 1)[:1] == [word]]
+        words = [lines[k].split() for k in rows]
+        try:
+            values = np.array([w[1:4] for w in words], dtype=np.float64).reshape(-1, 3)
+        except ValueError:
+            raise FormatError(f"'{path}': a line that begins with '{word}' is not three numbers") from None
+        if not len(values):
+            continue
+        moved = move_points(values, T) if word == "v" else values @ T[:3, :3].T
+        for k, row, rest in zip(rows, moved.tolist(), words, strict=True):
+            lines[k] = " ".join([word, *map(repr, row), *rest[4:]])
+    for k, line in enumerate(lines):
+        if line.startswith("mtllib "):
+            library = path.resolve().parent / line[7:].strip()
+            lines[k] = f"mtllib {os.path.relpath(library, to.resolve().parent)}"
+    return "\n".join(lines).encode("latin-1", errors="replace")
+
+
+def move_points(points: FloatArray, T: FloatArray) -> FloatArray:
+    """R p + t, computed about the cloud's own origin so that far coordinates keep their last digits."""
+    R, t = T[:3, :3], T[:3, 3]
+    finite = points[np.isfinite(points).all(axis=1)]
+    origin = choose_origin(finite) if len(finite) else np.zeros(3)
+    moved: FloatArray = (points - origin) @ R.T + (R @ origin + t)
+    return moved
+
+
+@writer(".off", mesh=True)
+def write_off(handle: BinaryIO, mesh: RawCloud) -> tuple[str, ...]:
     """OFF: vertices in full precision and triangles, no colours."""
     handle.write(f"OFF\n{len(mesh.points)} {_num_faces(mesh)} 0\n".encode("ascii"))
     write_rows(handle, [mesh.points])
     _write_faces(handle, mesh, "3 ", 0)
+    return _lost(mesh, "normals", "colors")
 
 
 def _write_faces(handle: BinaryIO, mesh: RawCloud, prefix: str, first: int) -> None:
@@ -217,7 +276,8 @@ def _write_faces(handle: BinaryIO, mesh: RawCloud, prefix: str, first: int) -> N
     handle.write("".join(lines).encode("ascii"))
 
 
-def write_stl(handle: BinaryIO, mesh: RawCloud) -> None:
+@writer(".stl", mesh=True)
+def write_stl(handle: BinaryIO, mesh: RawCloud) -> tuple[str, ...]:
     """STL: binary where single precision suffices, else ASCII with every digit; no colours."""
     assert mesh.faces is not None
     corners = mesh.points[mesh.faces]
@@ -231,12 +291,13 @@ def write_stl(handle: BinaryIO, mesh: RawCloud) -> None:
             lines += [f"vertex {x!r} {y!r} {z!r}" for x, y, z in corner]
             handle.write(("\n".join([*lines, "endloop", "endfacet"]) + "\n").encode("ascii"))
         handle.write(b"endsolid geomoe3d\n")
-        return
+        return _lost(mesh, "normals", "colors")
     rows = np.zeros(
         len(corners), dtype=np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("tag", "<u2")])
     )
     rows["normal"], rows["corners"] = normals, corners
     handle.write(b"geomoe3d".ljust(80) + struct.pack("<I", len(rows)) + rows.tobytes())
+    return _lost(mesh, "normals", "colors")
 
 
 def write_glb(handle: BinaryIO, geometry: Any, T: FloatArray) -> None:

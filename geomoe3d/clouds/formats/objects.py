@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geomoe3d.clouds.formats.arrays import table_cloud
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.types import FloatArray
@@ -23,7 +24,11 @@ def points_array(data: Any, what: str = "the points") -> FloatArray:
         InputError: not a real-number array of shape (N, 3); the message says what was found.
         EmptyCloudError: no rows.
     """
-    if isinstance(data, np.ma.MaskedArray):
+    return _array_cloud(data, what).points
+
+
+def _array_cloud(data: Any, what: str = "the points") -> RawCloud:
+    if isinstance(data, np.ma.MaskedArray) and data.dtype.names is None:
         data = np.ma.filled(data.astype(np.float64), np.nan)
     try:
         array = np.asarray(data)
@@ -36,27 +41,7 @@ def points_array(data: Any, what: str = "the points") -> FloatArray:
         )
     if array.size == 0:
         raise EmptyCloudError(f"{what} are empty: shape {array.shape}")
-    if array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{what} are of type {array.dtype}, expected floats or integers; convert them with "
-            "numpy.asarray(points, dtype=float) if they are real numbers"
-        )
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{what} have shape {array.shape}, expected (N, 3){_shape_hint(array)}")
-    return np.array(array, dtype=np.float64, order="C")
-
-
-def _shape_hint(array: NDArray[Any]) -> str:
-    if array.shape == (3,):
-        return "; a single point is points[None]"
-    if array.ndim == 2 and array.shape[0] == 3:
-        return "; pass points.T if each column is a point"
-    if array.ndim == 2 and array.shape[1] > 3:
-        return (
-            "; pass points[:, :3] for the coordinates alone, or an .npz file or a geomoe3d.types.PointCloud "
-            "to keep normals and colours"
-        )
-    return ""
+    return table_cloud(array, f"{what}", columns=False, error=InputError)
 
 
 def raw_from_object(data: Any) -> RawCloud:
@@ -69,14 +54,14 @@ def raw_from_object(data: Any) -> RawCloud:
     for base in type(data).__mro__:
         library = base.__module__.split(".")[0]
         if library == "torch":
-            return RawCloud(points_array(_from_torch(data)))
+            return _array_cloud(_from_torch(data))
         if library == "open3d":
             return _from_open3d(data)
         if library == "trimesh":
             from geomoe3d.clouds.formats.meshes import flatten
 
             return flatten(data)
-    return RawCloud(points_array(data))
+    return _array_cloud(data)
 
 
 def _from_torch(tensor: Any) -> Any:

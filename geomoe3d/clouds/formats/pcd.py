@@ -1,15 +1,13 @@
 """PCD: ascii, binary and compressed; SIZE 8 coordinates stay doubles.
 
-ASCII and binary are read here, with the header's count held against the content; only the compressed body
-is decoded by Open3D's tensor reader, after its sizes have been checked. The sensor pose in VIEWPOINT is not
-applied, as in the Point Cloud Library itself.
+All three are read here, with the header's count held against the content; no library of others sees the file.
+A sensor's pose in VIEWPOINT is not applied, as in the Point Cloud Library itself, but named.
 """
 
 from __future__ import annotations
 
-import io
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,16 +17,16 @@ from numpy.typing import NDArray
 from geomoe3d.clouds.formats.raw import (
     RawCloud,
     chunks,
+    cloud_of,
     columns_by_name,
     header_count,
-    read_columns,
-    scale_colors,
-    unread_names,
+    storable_fields,
+    wrong_count,
 )
-from geomoe3d.clouds.formats.text import DataLines, parse_table
+from geomoe3d.clouds.formats.registry import reader, writer
+from geomoe3d.clouds.formats.text import parse_numbers, write_rows
 from geomoe3d.clouds.recentre import fits_single_precision
 from geomoe3d.errors import FormatError
-from geomoe3d.types import FloatArray
 
 _KINDS = {
     **{"F4": "f4", "F8": "f8", "I1": "i1", "I2": "i2", "I4": "i4", "I8": "i8"},
@@ -44,6 +42,7 @@ class _Header:
     num_points: int
     data: str
     num_lines: int
+    unread: tuple[str, ...]
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -53,40 +52,37 @@ class _Header:
         return np.dtype(fields)
 
 
+@reader(".pcd")
 def read_pcd(path: Path) -> RawCloud:
-    """Points with normals (normal_x ...) and colours (packed rgb, or r, g, b).
+    """Points with normals (normal_x ...), colours (packed rgb, or r, g, b) and fields.
 
     Raises:
         FormatError: no PCD, a header that does not parse, or a count that the content does not bear out.
     """
     with path.open("rb") as handle:
         header = _read_header(handle, path)
-        groups = columns_by_name(header.names)
-        if "points" not in groups:
-            raise FormatError(f"'{path}': the fields have no x, y, z, only: {' '.join(header.names)}")
-        packed = next((k for k, name in enumerate(header.names) if name.lower() in ("rgb", "rgba")), None)
-        if packed is not None and header.kinds[packed] in ("f4", "u4", "i4"):
-            groups["packed"] = [packed]
-        if any(header.counts[k] != 1 for columns in groups.values() for k in columns):
-            raise FormatError(f"'{path}': coordinates, normals and colours need COUNT 1")
-        if header.data == "binary_compressed":
-            return replace(_read_compressed(handle, path, header), unread=_unread(header.names, groups))
-        if header.data == "ascii":
-            columns = _read_ascii(handle, path, header, groups)
+        single = [k for k, count in enumerate(header.counts) if count == 1 and header.names[k] != "_"]
+        if "points" not in columns_by_name([header.names[k] for k in single]):
+            raise FormatError(f"'{path}': no fields x, y, z of COUNT 1, only: {' '.join(header.names)}")
+        read = {"ascii": _read_ascii, "binary": _read_binary}.get(header.data, _read_compressed)
+        columns = read(handle, path, header)
+    names: list[str] = []
+    chosen: list[NDArray[Any]] = []
+    for k in single:
+        packed = header.names[k].lower() in ("rgb", "rgba") and columns[k].dtype.itemsize == 4
+        if packed and "red" not in names:
+            names += ["red", "green", "blue"]
+            bits = np.ascontiguousarray(columns[k]).view(np.uint32)  # 0x00RRGGBB, as a float too
+            chosen += [(bits >> shift).astype(np.uint8) for shift in (16, 8, 0)]
+            if header.names[k].lower() == "rgba" and len(np.unique(bits >> 24)) > 1:
+                names.append("alpha")
+                chosen.append((bits >> 24).astype(np.uint8))
         else:
-            columns = _read_binary(handle, path, header, groups)
-    colors = None
-    if "colors" in columns:
-        colors = scale_colors(columns["colors"])
-    elif "packed" in columns:
-        colors = _unpack(columns["packed"])
-    unread = _unread(header.names, groups)
-    return RawCloud(columns["points"], columns.get("normals"), colors, unread=unread)
-
-
-def _unread(names: list[str], groups: dict[str, list[int]]) -> tuple[str, ...]:
-    """Without ``_``, the name of padding."""
-    return tuple(name for name in unread_names(names, groups) if name != "_")
+            names.append(header.names[k])
+            chosen.append(columns[k])
+    wide = [name for name, count in zip(header.names, header.counts, strict=True) if count != 1]
+    unread = (*(name for name in wide if name != "_"), *header.unread)
+    return cloud_of(names, chosen, unread=unread)
 
 
 def _read_header(handle: BinaryIO, path: Path) -> _Header:
@@ -134,46 +130,54 @@ def _read_header(handle: BinaryIO, path: Path) -> _Header:
     if data not in ("ascii", "binary", "binary_compressed"):
         raise FormatError(f"'{path}': unknown DATA '{data}'; known: ascii, binary, binary_compressed")
     repeats = [header_count(count, path, "COUNT") for count in counts]
-    return _Header(names, [_KINDS[kind] for kind in kinds], repeats, num_points, data, num_lines)
+    if not 0 < sum(repeats) < 1 << 20:
+        raise FormatError(f"'{path}': COUNT names {sum(repeats)} values per point")
+    unread: list[str] = []
+    if entries.get("VIEWPOINT") and not _is_identity(entries["VIEWPOINT"]):
+        unread.append(f"sensor pose (VIEWPOINT {' '.join(entries['VIEWPOINT'])})")
+    if len(grid) == 2 and grid[1] > 1:
+        unread.append(f"grid of {grid[0]} x {grid[1]}")
+    return _Header(
+        names, [_KINDS[kind] for kind in kinds], repeats, num_points, data, num_lines, tuple(unread)
+    )
 
 
-def _wrong_count(path: Path, said: int, held: int) -> FormatError:
-    reason = "it is truncated or its header is wrong" if held < said else "its header is wrong"
-    return FormatError(f"'{path}': the header says {said} points, the file holds {held}; {reason}")
+def _is_identity(viewpoint: list[str]) -> bool:
+    try:
+        return [float(value) for value in viewpoint] == [0, 0, 0, 1, 0, 0, 0]
+    except ValueError:
+        return False
 
 
-def _read_ascii(
-    handle: BinaryIO, path: Path, header: _Header, groups: dict[str, list[int]]
-) -> dict[str, NDArray[Any]]:
-    with io.TextIOWrapper(handle, encoding="latin-1") as text:
-        table = parse_table(path, DataLines(text, header.num_lines), None, sum(header.counts))
-    if len(table) != header.num_points:
-        raise _wrong_count(path, header.num_points, len(table))
-    first = np.concatenate([[0], np.cumsum(header.counts)])[:-1]
-    columns: dict[str, NDArray[Any]] = {}
-    for group, fields in groups.items():
-        part = np.ascontiguousarray(table[:, first[fields]])
-        # Coordinates keep all printed digits whatever SIZE says; packed colours are the bits of their type.
-        if group == "packed" and not np.isfinite(part).all():
-            continue
-        columns[group] = part.astype(header.kinds[fields[0]]) if group == "packed" else part
-        if group == "colors" and header.kinds[fields[0]] == "u1":
-            columns[group] = part.astype(np.uint8)
+def _read_ascii(handle: BinaryIO, path: Path, header: _Header) -> list[NDArray[Any]]:
+    """Columns as printed, whatever SIZE says; only whole numbers and packed colours take their type."""
+    width = sum(header.counts)
+    numbers = parse_numbers(path, handle.read(), header.num_lines)
+    if len(numbers) != header.num_points * width:
+        raise wrong_count(path, header.num_points, len(numbers) // width)
+    table = numbers.reshape(-1, width)
+    columns: list[NDArray[Any]] = []
+    for name, kind, first in zip(
+        header.names, header.kinds, np.cumsum([0, *header.counts])[:-1].tolist(), strict=True
+    ):
+        column = table[:, min(first, width - 1)]
+        with np.errstate(all="ignore"):
+            stored = column.astype(kind)
+        is_packed = name.lower() in ("rgb", "rgba") and bool(np.isfinite(column).all())
+        is_whole = kind[0] != "f" and np.array_equal(stored, column)
+        columns.append(stored if is_packed or is_whole else column)
     return columns
 
 
-def _read_binary(
-    handle: BinaryIO, path: Path, header: _Header, groups: dict[str, list[int]]
-) -> dict[str, NDArray[Any]]:
-    rest = path.stat().st_size - handle.tell()
+def _read_binary(handle: BinaryIO, path: Path, header: _Header) -> list[NDArray[Any]]:
     itemsize = header.dtype.itemsize
-    held = rest // itemsize
+    rest = path.stat().st_size - handle.tell()
     surplus = rest - header.num_points * itemsize
-    if held < header.num_points or surplus >= itemsize:
-        raise _wrong_count(path, header.num_points, held)
-    columns = read_columns(handle, header.dtype, header.num_points, groups)
+    if surplus < 0 or surplus >= itemsize:
+        raise wrong_count(path, header.num_points, rest // itemsize)
+    rows = np.fromfile(handle, dtype=header.dtype, count=header.num_points)
     _check_end(handle, path)
-    return columns
+    return [rows[f"f{k}"] for k in range(len(header.names))]
 
 
 def _check_end(handle: BinaryIO, path: Path) -> None:
@@ -186,8 +190,8 @@ def _check_end(handle: BinaryIO, path: Path) -> None:
         )
 
 
-def _read_compressed(handle: BinaryIO, path: Path, header: _Header) -> RawCloud:
-    """Check the sizes, then let Open3D's tensor reader (exact for float and double) undo the LZF coding."""
+def _read_compressed(handle: BinaryIO, path: Path, header: _Header) -> list[NDArray[Any]]:
+    """Column after column, coded together by LZF."""
     sizes = handle.read(8)
     rest = path.stat().st_size - handle.tell()
     packed, unpacked = struct.unpack("<II", sizes) if len(sizes) == 8 else (1, 0)
@@ -196,53 +200,89 @@ def _read_compressed(handle: BinaryIO, path: Path, header: _Header) -> RawCloud:
             f"'{path}': the compressed part should have {packed} bytes, the file holds {rest}; truncated"
         )
     if unpacked != header.num_points * header.dtype.itemsize:
-        raise _wrong_count(path, header.num_points, unpacked // header.dtype.itemsize)
-    handle.seek(packed, io.SEEK_CUR)
+        raise wrong_count(path, header.num_points, unpacked // header.dtype.itemsize)
+    body = handle.read(packed)
     _check_end(handle, path)
-    if not header.num_points:
-        return RawCloud(np.empty((0, 3)))
-    import open3d as o3d
-
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud: Any = o3d.t.io.read_point_cloud(path, format="pcd")
-    held = len(cloud.point.positions) if "positions" in cloud.point else 0
-    if held != header.num_points:
-        raise FormatError(
-            f"'{path}': the compressed part is damaged, {held} of {header.num_points} points could be decoded"
-        )
-    normals = cloud.point.normals.numpy().astype(np.float64) if "normals" in cloud.point else None
-    colors = scale_colors(cloud.point.colors.numpy()) if "colors" in cloud.point else None
-    return RawCloud(cloud.point.positions.numpy().astype(np.float64), normals, colors)
+    try:
+        plain = _unpack_lzf(body, unpacked)
+    except (IndexError, ValueError):
+        raise FormatError(f"'{path}': the compressed part is damaged") from None
+    columns: list[NDArray[Any]] = []
+    place = 0
+    for kind, count in zip(header.kinds, header.counts, strict=True):
+        column = np.frombuffer(plain, "<" + kind, header.num_points * count, place)
+        columns.append(column)
+        place += column.nbytes
+    return columns
 
 
-def _unpack(packed: NDArray[Any]) -> FloatArray:
-    """Colours from 0x00RRGGBB, stored as an integer or in the bits of a float."""
-    bits = packed[:, 0].view(np.uint32)
-    return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255.0
+def _unpack_lzf(packed: bytes, size: int) -> bytearray:
+    """Undo LZF: a byte below 32 precedes that many bytes and one; others say how far back to copy from.
+
+    About 20 MB per second in plain Python: there is no package with wheels.
+
+    Raises:
+        IndexError, ValueError: damaged.
+    """
+    out = bytearray()
+    place, end = 0, len(packed)
+    while place < end:
+        control = packed[place]
+        place += 1
+        if control < 32:
+            out += packed[place : place + control + 1]
+            place += control + 1
+        else:
+            length = (control >> 5) + 2
+            if length == 9:
+                length += packed[place]
+                place += 1
+            begin = len(out) - ((control & 31) << 8) - packed[place] - 1
+            place += 1
+            if begin < 0:
+                raise ValueError
+            piece = out[begin : begin + length]
+            out += (piece * (length // len(piece) + 1))[:length]  # a copy may run into itself
+        if len(out) > size:
+            raise ValueError
+    if len(out) != size or place != end:
+        raise ValueError
+    return out
 
 
-def write_pcd(handle: BinaryIO, cloud: RawCloud) -> None:
-    """Binary PCD with float coordinates where those suffice, else ASCII with double coordinates.
+@writer(".pcd")
+def write_pcd(
+    handle: BinaryIO, cloud: RawCloud, single: bool | None = None, note: str = ""
+) -> tuple[str, ...]:
+    """Binary PCD with float coordinates where those suffice, else ASCII with every digit.
 
     The Point Cloud Library and Open3D's legacy reader take binary floats and misread binary doubles, so
     floats are written when they move no coordinate by more than 1e-6 of the cloud's spread. At map
-    coordinates they would lose decimetres: there every digit is printed. Normals are floats, colours 8 bit
-    in a packed rgb.
+    coordinates they would lose decimetres: there every digit is printed, though as SIZE 4, without which
+    the Point Cloud Library finds no coordinates. Normals are floats, colours 8 bit in a packed rgb.
+
+    Args:
+        handle: the file.
+        cloud: what to write.
+        single: whether to write floats; None decides as above.
+        note: one more line of comment.
     """
-    single = fits_single_precision(cloud.points)
-    size = 4 if single else 8
-    fields = [(axis, size, "F") for axis in "xyz"]
+    if single is None:
+        single = fits_single_precision(cloud.points)
+    fields = [(axis, 4, "F") for axis in "xyz"]
     if cloud.normals is not None:
         fields += [(f"normal_{axis}", 4, "F") for axis in "xyz"]
     if cloud.colors is not None:
         fields.append(("rgb", 4, "U"))
+    kept, lost = storable_fields(cloud, _KINDS.values(), {"_", "rgba", *(name for name, _, _ in fields)})
+    fields += [(n, v.dtype.itemsize, v.dtype.kind.upper()) for n, v in kept.items()]
     num = len(cloud.points)
-    lines = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7"]
+    lines = ["# .PCD v0.7 - Point Cloud Data file format", *([f"# {note}"] * bool(note)), "VERSION 0.7"]
     for k, key in enumerate(("FIELDS", "SIZE", "TYPE")):
         lines.append(f"{key} {' '.join(str(entry[k]) for entry in fields)}")
     lines += [f"COUNT {' '.join('1' for _ in fields)}", f"WIDTH {num}", "HEIGHT 1"]
     lines += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {num}", f"DATA {'binary' if single else 'ascii'}"]
-    handle.write(("\n".join(lines) + "\n").encode("ascii"))
+    handle.write(("\n".join(lines) + "\n").encode())
     dtype = np.dtype([(f"f{k}", f"<{kind.lower()}{size}") for k, (_, size, kind) in enumerate(fields)])
     for part in chunks(num, dtype.itemsize):
         columns = [cloud.points[part, k] for k in range(3)]
@@ -251,16 +291,12 @@ def write_pcd(handle: BinaryIO, cloud: RawCloud) -> None:
         if cloud.colors is not None:
             r, g, b = np.rint(cloud.colors[part] * 255.0).astype(np.uint32).T
             columns.append((r << 16) | (g << 8) | b)
+        columns += [values[part] for values in kept.values()]
         if single:
             block = np.empty(part.stop - part.start, dtype=dtype)
             for k, column in enumerate(columns):
                 block[f"f{k}"] = column
             handle.write(block.tobytes())
         else:
-            _write_text_rows(handle, columns)
-
-
-def _write_text_rows(handle: BinaryIO, columns: list[NDArray[Any]]) -> None:
-    for start in range(0, len(columns[0]), 50_000):
-        rows = zip(*(column[start : start + 50_000].tolist() for column in columns), strict=True)
-        handle.write(("\n".join([" ".join(map(repr, row)) for row in rows]) + "\n").encode("ascii"))
+            write_rows(handle, [column[:, None] for column in columns])
+    return lost

@@ -1,29 +1,33 @@
-"""PLY: ascii and binary of both byte orders, every scalar type, faces; doubles stay doubles.
+"""PLY: ascii and binary of both byte orders, every scalar type, lists, faces; doubles stay doubles.
 
-Own code because the usual readers return made-up rows for a truncated file or print to the terminal. The
-header's counts are held against the file's size before anything is read; reading is chunked.
+Own code because the usual readers return made-up rows for a truncated file, print to the terminal, or walk
+lists in Python row by row. The header's counts are held against the file's size. The numbers of an ascii file
+are parsed into doubles and then read like a binary file of nothing but doubles.
 """
 
 from __future__ import annotations
 
-import io
+import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geomoe3d.clouds.formats.raw import (
     RawCloud,
     chunks,
+    cloud_of,
     columns_by_name,
     header_count,
-    read_columns,
-    scale_colors,
-    unread_names,
+    storable_fields,
+    wrong_count,
 )
-from geomoe3d.clouds.formats.text import DataLines, parse_table
+from geomoe3d.clouds.formats.registry import reader, writer
+from geomoe3d.clouds.formats.text import parse_numbers
 from geomoe3d.errors import FormatError
 from geomoe3d.types import IntArray
 
@@ -35,6 +39,10 @@ _TYPES = {
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
+_INDICES = ("vertex_indices", "vertex_index")
+_Bytes = NDArray[np.uint8]
+
+
 @dataclass
 class _Element:
     """One element of the header; a property is (name, type, type of its length or None)."""
@@ -43,16 +51,14 @@ class _Element:
     count: int
     properties: list[tuple[str, str, str | None]] = field(default_factory=list)
 
-    @property
-    def has_lists(self) -> bool:
-        return any(length is not None for _, _, length in self.properties)
-
-    def dtype(self, order: str) -> np.dtype[Any]:
-        return np.dtype([(f"f{k}", order + kind) for k, (_, kind, _) in enumerate(self.properties)])
+    def stored_as(self, kind: str) -> _Element:
+        """The same with every value of one type, as `parse_numbers` gives those of an ascii file."""
+        return _Element(self.name, self.count, [(n, kind, t and kind) for n, _, t in self.properties])
 
 
+@reader(".ply")
 def read_ply(path: Path) -> RawCloud:
-    """Vertices with normals and colours, and the faces (polygons cut into triangle fans) if there are any.
+    """Vertices with all their numbers, and the faces (polygons cut into triangle fans) if there are any.
 
     Raises:
         FormatError: no PLY, an unknown header line, or counts that the file's content does not bear out.
@@ -63,19 +69,53 @@ def read_ply(path: Path) -> RawCloud:
         if "vertex" not in names:
             raise FormatError(f"'{path}' has no element 'vertex', only: {', '.join(names) or 'nothing'}")
         vertex = elements[names.index("vertex")]
-        groups = columns_by_name([name for name, _, _ in vertex.properties])
-        if "points" not in groups:
-            found = ", ".join(name for name, _, _ in vertex.properties) or "none"
-            raise FormatError(f"'{path}': the vertices have no properties x, y, z, only: {found}")
-        if vertex.has_lists:
-            raise FormatError(f"'{path}': vertices with list properties are not supported")
-        unread = unread_names([name for name, _, _ in vertex.properties], groups)
+        scalars = [name for name, _, length in vertex.properties if length is None]
+        if "points" not in columns_by_name(scalars):
+            raise FormatError(
+                f"'{path}': the vertices have no properties x, y, z, only: {', '.join(scalars) or 'none'}"
+            )
+        body: _Bytes
         if order == "=":
-            with io.TextIOWrapper(handle, encoding="latin-1") as text:
-                cloud = _read_ascii(DataLines(text, num_lines), path, elements, groups)
+            body = parse_numbers(path, handle.read(), num_lines).view(np.uint8)
         else:
-            cloud = _read_binary(handle, path, order, elements, groups)
-    return replace(cloud, unread=unread)
+            body = np.fromfile(handle, dtype=np.uint8)
+    columns: list[NDArray[Any]] = []
+    faces: IntArray | None = None
+    unread = [name for name, _, length in vertex.properties if length is not None]
+    place = 0
+    for element in elements:
+        stored = element.stored_as("f8") if order == "=" else element
+        rows, place = _read_rows(body, place, order, stored, path, element is elements[-1])
+        if element is vertex:
+            for k, (_, kind, length) in enumerate(element.properties):
+                if length is None:
+                    columns.append(_declared(rows.scalars(k), kind))
+        elif element.name == "face":
+            for k, (name, _, length) in enumerate(element.properties):
+                if length is not None and name in _INDICES:
+                    faces = _fans(rows.polygons(k))
+                else:
+                    unread.append(f"face {name}")
+        elif element.count:
+            unread.append(f"element {element.name}")
+    rest = body[place:]
+    if order == "=" and len(rest):
+        raise FormatError(f"'{path}' holds {len(rest) // 8} numbers more than its header describes")
+    if rest[:64].tobytes().strip(b"\0\r\n\t "):
+        raise FormatError(
+            f"'{path}' holds {len(body)} bytes behind its header, its header describes {place}; the counts "
+            "in it are wrong"
+        )
+    return cloud_of(scalars, columns, faces=_checked_faces(faces, vertex.count, path), unread=tuple(unread))
+
+
+def _declared(column: NDArray[Any], kind: str) -> NDArray[Any]:
+    """A column in the type that the header says, where that holds it; ascii keeps all printed digits."""
+    if column.dtype.kind + str(column.dtype.itemsize) == kind:
+        return column
+    with np.errstate(all="ignore"):
+        declared = column.astype(kind)
+    return declared if np.array_equal(declared, column, equal_nan=True) else column
 
 
 def _read_header(handle: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
@@ -107,168 +147,138 @@ def _read_header(handle: BinaryIO, path: Path) -> tuple[str, list[_Element], int
     raise FormatError(f"'{path}': the header does not end; the file is truncated or no PLY")
 
 
-def _read_ascii(
-    lines: DataLines, path: Path, elements: list[_Element], groups: dict[str, list[int]]
-) -> RawCloud:
-    cloud = RawCloud(np.empty((0, 3)))
-    faces: IntArray | None = None
-    for element in elements:
-        lines.begin(element.count)
-        try:
-            if element.name == "vertex":
-                cloud = _ascii_vertices(lines, path, element, groups)
-            elif element.name == "face" and _index_property(element) is not None:
-                faces = _ascii_faces(lines, path, element)
-            else:
-                for _ in lines:
-                    pass
-        except FormatError:
-            broken = lines.taken
-            lines.begin(1)
-            if next(lines, None) is None:  # the last line of the file is cut off: the counts say it better
-                raise _wrong_count(path, element, broken - 1) from None
-            raise
-        if lines.taken < element.count:
-            raise _wrong_count(path, element, lines.taken)
-    lines.begin(1 << 60)
-    extra = sum(1 for _ in lines)
-    if extra:
-        raise _wrong_count(path, elements[-1], elements[-1].count + extra)
-    return replace(cloud, faces=_checked_faces(faces, len(cloud.points), path))
+class _Rows:
+    """Rows of equal layout, as a structured array with the fields of `_layout`."""
+
+    def __init__(self, table: NDArray[Any]) -> None:
+        self._table = table
+
+    def scalars(self, k: int) -> NDArray[Any]:
+        """The values (rows,) of property ``k``."""
+        return self._table[f"{k}"]
+
+    def polygons(self, k: int) -> list[tuple[IntArray, IntArray]]:
+        """The lists of property ``k`` by their length: which rows, and their values (rows, length)."""
+        return [(np.arange(len(self._table)), _whole(self._table[f"{k}"]))]
 
 
-def _wrong_count(path: Path, element: _Element, held: int) -> FormatError:
-    return FormatError(
-        f"'{path}': the header says {element.count} rows of '{element.name}', the file holds {held}; "
-        f"{'it is truncated or ' if held < element.count else ''}its header is wrong"
-    )
+class _RaggedRows(_Rows):
+    """Rows whose lists differ in length: where each property of each row begins."""
+
+    def __init__(self, body: _Bytes, starts: list[IntArray], order: str, element: _Element) -> None:
+        self._body, self._starts, self._order, self._element = body, starts, order, element
+
+    def scalars(self, k: int) -> NDArray[Any]:
+        return self._take(self._starts[k], self._element.properties[k][1], 1)[:, 0]
+
+    def polygons(self, k: int) -> list[tuple[IntArray, IntArray]]:
+        _, kind, head = self._element.properties[k]
+        assert head is not None
+        lengths = self._take(self._starts[k], head, 1)[:, 0].astype(np.int64)
+        found = []
+        for length in np.unique(lengths):
+            rows = np.flatnonzero(lengths == length)
+            begin = self._starts[k][rows] + np.dtype(head).itemsize
+            found.append((rows, _whole(self._take(begin, kind, int(length)))))
+        return found
+
+    def _take(self, begin: IntArray, kind: str, count: int) -> NDArray[Any]:
+        width = count * np.dtype(kind).itemsize
+        block: NDArray[Any] = self._body[begin[:, None] + np.arange(width)]
+        return block.view(self._order + kind) if width else np.empty((len(begin), 0))
 
 
-def _ascii_vertices(
-    lines: DataLines, path: Path, element: _Element, groups: dict[str, list[int]]
-) -> RawCloud:
-    table = parse_table(path, lines, None, len(element.properties))
-    normals = table[:, groups["normals"]] if "normals" in groups else None
-    colors = None
-    if "colors" in groups:
-        colors = scale_colors(table[:, groups["colors"]], element.properties[groups["colors"][0]][1])
-    return RawCloud(np.ascontiguousarray(table[:, groups["points"]]), normals, colors)
+def _read_rows(
+    body: _Bytes, place: int, order: str, element: _Element, path: Path, last: bool
+) -> tuple[_Rows, int]:
+    """The rows of an element that begin at byte ``place``, and the byte behind them.
 
-
-def _index_property(element: _Element) -> int | None:
-    """Position of the list of vertex indices."""
-    for k, (name, _, length) in enumerate(element.properties):
-        if length is not None and name in ("vertex_indices", "vertex_index"):
-            return k
-    return None
-
-
-def _ascii_faces(lines: DataLines, path: Path, element: _Element) -> IntArray:
-    triangles: list[list[int]] = []
-    wanted = _index_property(element)
-    for line in lines:
-        words = line.split()
-        place = 0
-        try:
-            for k, (_, _, length) in enumerate(element.properties):
-                size = 0 if length is None else int(words[place])
-                if k == wanted:
-                    polygon = [int(word) for word in words[place + 1 : place + 1 + size]]
-                    triangles += [[polygon[0], polygon[j], polygon[j + 1]] for j in range(1, size - 1)]
-                place += 1 + size
-            if place != len(words):
-                raise IndexError
-        except (ValueError, IndexError):
-            raise FormatError(f"{lines.where(path)} is no row of element 'face'") from None
-    return np.array(triangles, dtype=np.int64).reshape(-1, 3)
-
-
-def _read_binary(
-    handle: BinaryIO, path: Path, order: str, elements: list[_Element], groups: dict[str, list[int]]
-) -> RawCloud:
-    place = handle.tell()
-    size = path.stat().st_size
-    columns: dict[str, Any] = {}
-    faces: IntArray | None = None
-    for element in elements:
-        if element.has_lists:
-            place, triangles = _walk_lists(path, place, size, order, element)
-            faces = triangles if element.name == "face" else faces
-            continue
-        dtype = element.dtype(order)
-        held = (size - place) // dtype.itemsize if dtype.itemsize else element.count
-        last = element is elements[-1]
-        if held < element.count or (last and held > element.count):
-            raise _wrong_count(path, element, held)
-        if element.name == "vertex":
-            handle.seek(place)
-            columns = read_columns(handle, dtype, element.count, groups)
-        place += element.count * dtype.itemsize
-    handle.seek(place)
-    if handle.read(64).strip(b"\0\r\n\t "):
-        raise FormatError(
-            f"'{path}' is {size} bytes long, its header describes {place}; the counts in its header are wrong"
-        )
-    colors = scale_colors(columns["colors"]) if "colors" in columns else None
-    points = columns["points"]
-    faces = _checked_faces(faces, len(points), path)
-    return RawCloud(points, columns.get("normals"), colors, faces)
-
-
-def _walk_lists(path: Path, place: int, size: int, order: str, element: _Element) -> tuple[int, IntArray]:
-    """Step over rows that hold lists and collect their triangles; returns the byte behind the last row.
-
-    Rows of equal layout (nearly always all of them) are taken many at a time.
+    Raises:
+        FormatError: the body holds fewer rows, or, behind the last element without lists, more.
     """
-    data = np.memmap(path, dtype=np.uint8, mode="r") if element.count else np.empty(0, np.uint8)
-    wanted = _index_property(element)
-    found: list[IntArray] = []
-    done, window = 0, 1
-    while done < element.count:
-        layout, stride = _row_layout(data, place, order, element)
-        rows = min(window, element.count - done, (size - place) // stride if stride else element.count)
-        if rows < 1:
-            raise _wrong_count(path, element, done)
-        same = np.ones(rows, dtype=np.bool_)
-        for offset, kind, length, _ in layout:
-            same &= np.ndarray((rows,), order + kind, data, place + offset, (stride,)) == length
-        rows = rows if same.all() else int(np.argmin(same))
-        if wanted is not None:
-            lists = [k for k, (_, _, length) in enumerate(element.properties) if length is not None]
-            offset, kind, length, item = layout[lists.index(wanted)]
-            start = place + offset + np.dtype(kind).itemsize
-            width = np.dtype(item).itemsize
-            polygons = np.ndarray((rows, length), order + item, data, start, (stride, width)).astype(np.int64)
-            found += [polygons[:, [0, j, j + 1]] for j in range(1, length - 1)]
-        done += rows
-        place += rows * stride
-        window = window * 2 if same.all() else 1
-    return place, np.concatenate(found) if found else np.empty((0, 3), dtype=np.int64)
+    what = f"rows of '{element.name}'"
+    has_lists = any(length is not None for _, _, length in element.properties)
+    if not (element.count and element.properties):
+        return _Rows(
+            np.empty(0, [(f"{k}", kind) for k, (_, kind, _) in enumerate(element.properties)])
+        ), place
+    layout = _layout(body, place, order, element)
+    if layout is None:
+        raise wrong_count(path, element.count, 0, what)
+    size = layout.itemsize
+    held = (len(body) - place) // size
+    if not has_lists and (held < element.count or (last and held > element.count)):
+        raise wrong_count(path, element.count, held, what)
+    if held >= element.count:
+        table = np.frombuffer(body, layout, element.count, place)
+        lengths = [name for name in layout.names or () if name.startswith("#")]
+        if all((table[name] == table[name][:1]).all() for name in lengths):
+            return _Rows(table), place + element.count * size
+    return _walk(body, place, order, element, path)
 
 
-def _row_layout(
-    data: np.ndarray[Any, np.dtype[np.uint8]], place: int, order: str, element: _Element
-) -> tuple[list[tuple[int, str, int, str]], int]:
-    """Lists of the row at ``place`` as (offset, type of the length, length, type of an item), and its size.
+def _layout(body: _Bytes, place: int, order: str, element: _Element) -> np.dtype[Any] | None:
+    """The type of the row at ``place``, a field per property, '#' before that of its list's length.
 
-    A row that the file does not hold completely gets a size beyond the file's end.
+    None where the body does not hold the lengths of the row's lists.
     """
-    layout = []
-    offset = 0
-    for _, kind, length_kind in element.properties:
-        width = np.dtype(kind).itemsize
-        if length_kind is None:
-            offset += width
-            continue
-        head = np.dtype(length_kind).itemsize
-        if place + offset + head > len(data):
-            return [], len(data) + 1
-        length = int(np.ndarray((), order + length_kind, data, place + offset))
-        if length < 0:
-            return [], len(data) + 1
-        layout.append((offset, length_kind, length, kind))
-        offset += head + length * width
-    return layout, offset
+    fields: list[Any] = []
+    size = 0
+    for k, (_, kind, head) in enumerate(element.properties):
+        if head is not None:
+            if place + size + np.dtype(head).itemsize > len(body):
+                return None
+            length = float(np.ndarray((), order + head, body, place + size))
+            if not 0 <= length <= len(body):
+                return None
+            fields += [(f"#{k}", order + head), (f"{k}", order + kind, (int(length),))]
+            size += np.dtype(head).itemsize + int(length) * np.dtype(kind).itemsize
+        else:
+            fields.append((f"{k}", order + kind))
+            size += np.dtype(kind).itemsize
+    return np.dtype(fields) if size < 1 << 31 else None
+
+
+def _walk(body: _Bytes, place: int, order: str, element: _Element, path: Path) -> tuple[_Rows, int]:
+    """Step through rows whose lists differ in length, the one way to find where each begins."""
+    steps = []  # per property: bytes of a scalar, or the reader of a length and the bytes of an item
+    for _, kind, head in element.properties:
+        unpack = struct.Struct(order + np.dtype(head).char).unpack_from if head is not None else None
+        steps.append((unpack, np.dtype(head).itemsize if head is not None else 0, np.dtype(kind).itemsize))
+    view = body.tobytes()
+    starts: list[list[int]] = [[] for _ in steps]
+    for row in range(element.count):
+        try:
+            for begin, (unpack, head_size, item) in zip(starts, steps, strict=True):
+                begin.append(place)
+                length = 1 if unpack is None else int(unpack(view, place)[0])
+                if length < 0:
+                    raise ValueError
+                place += head_size + length * item
+            if place > len(body):
+                raise ValueError
+        except (struct.error, ValueError, OverflowError):  # also a length that is no number
+            raise wrong_count(path, element.count, row, f"rows of '{element.name}'") from None
+    return _RaggedRows(body, [np.array(s, dtype=np.int64) for s in starts], order, element), place
+
+
+def _whole(values: NDArray[Any]) -> IntArray:
+    """Indices as integers; what is none becomes -1, which no vertex has."""
+    with np.errstate(invalid="ignore"):
+        whole = values.astype(np.int64)
+    return np.where(whole == values, whole, -1)
+
+
+def _fans(polygons: list[tuple[IntArray, IntArray]]) -> IntArray:
+    """Triangles (M, 3) of polygons, in the order of their rows."""
+    rows, triangles = [np.empty(0, np.int64)], [np.empty((0, 3), np.int64)]
+    for which, corners in polygons:
+        for k in range(1, corners.shape[1] - 1):
+            rows.append(which)
+            triangles.append(corners[:, [0, k, k + 1]])
+    order = np.argsort(np.concatenate(rows), kind="stable")
+    found: IntArray = np.concatenate(triangles)[order]
+    return found
 
 
 def _checked_faces(faces: IntArray | None, num_points: int, path: Path) -> IntArray | None:
@@ -282,23 +292,36 @@ def _checked_faces(faces: IntArray | None, num_points: int, path: Path) -> IntAr
     return faces
 
 
-def write_ply(handle: BinaryIO, cloud: RawCloud) -> None:
-    """Binary little-endian PLY: double coordinates and normals, 8 bit colours, triangles if there are any."""
-    rows: list[tuple[str, str]] = [(axis, "<f8") for axis in "xyz"]
+@writer(".ply")
+@writer(".ply", mesh=True)
+def write_ply(handle: BinaryIO, cloud: RawCloud, single: bool = False, note: str = "") -> tuple[str, ...]:
+    """Binary little-endian PLY: 8 bit colours, fields in their own types, triangles if there are any.
+
+    Args:
+        handle: the file.
+        cloud: what to write.
+        single: coordinates and normals as floats instead of doubles; Point Cloud Library and small_gicp take
+            no doubles, and show an empty cloud.
+        note: one more line of comment.
+    """
+    rows = [(axis, "f4" if single else "f8") for axis in "xyz"]
     if cloud.normals is not None:
-        rows += [(axis, "<f8") for axis in ("nx", "ny", "nz")]
+        rows += [(axis, "f4" if single else "f8") for axis in ("nx", "ny", "nz")]
     if cloud.colors is not None:
         rows += [(color, "u1") for color in ("red", "green", "blue")]
+    kept, lost = storable_fields(cloud, _WRITTEN, {name for name, _ in rows})
+    rows += [(name, values.dtype.str[1:]) for name, values in kept.items()]
     header = ["ply", "format binary_little_endian 1.0", "comment written by geomoe3d"]
+    header += [f"comment {note}"] * bool(note)
     header.append(f"element vertex {len(cloud.points)}")
-    header += [f"property {'uchar' if kind == 'u1' else 'double'} {name}" for name, kind in rows]
+    header += [f"property {_WRITTEN[kind]} {name}" for name, kind in rows]
     if cloud.faces is not None:
         header += [f"element face {len(cloud.faces)}", "property list uchar int vertex_indices"]
-    handle.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-    dtype = np.dtype(rows)
+    handle.write(("\n".join([*header, "end_header"]) + "\n").encode())
+    dtype = np.dtype([(name, "<" + kind) for name, kind in rows])
     for part in chunks(len(cloud.points), dtype.itemsize):
         block = np.empty(part.stop - part.start, dtype=dtype)
-        for name, values in _write_columns(cloud, part):
+        for name, values in chain(_write_columns(cloud, part), ((n, v[part]) for n, v in kept.items())):
             block[name] = values
         handle.write(block.tobytes())
     if cloud.faces is not None:
@@ -306,6 +329,13 @@ def write_ply(handle: BinaryIO, cloud: RawCloud) -> None:
         triangles["n"] = 3
         triangles["v"] = cloud.faces
         handle.write(triangles.tobytes())
+    return lost
+
+
+_WRITTEN = {
+    **{"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
+    **{"f4": "float", "f8": "double"},
+}
 
 
 def _write_columns(cloud: RawCloud, part: slice) -> Iterator[tuple[str, Any]]:

@@ -1,16 +1,16 @@
 """What every reader returns and every writer takes, and the rules that all formats share.
 
-Here live the meaning of column names, the rule for unnamed columns, the scaling of colours and the chunked
-reading of fixed-size binary rows. Everything is numpy; a read of N rows holds the result plus one chunk.
+Here live the meaning of column names, the rule for unnamed columns and the scaling of colours. A reader hands
+over named columns in the types of its file; `cloud_of` makes points, normals, colours and fields of them.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,15 @@ from geomoe3d.types import FloatArray, IntArray
 CHUNK_BYTES = 1 << 24
 
 _ALIASES = {
-    "x": ("x",),
-    "y": ("y",),
-    "z": ("z",),
-    "nx": ("nx", "normal_x", "normalx", "n_x"),
-    "ny": ("ny", "normal_y", "normaly", "n_y"),
-    "nz": ("nz", "normal_z", "normalz", "n_z"),
-    "red": ("red", "r", "rf", "diffuse_red"),
-    "green": ("green", "g", "gf", "diffuse_green"),
-    "blue": ("blue", "b", "bf", "diffuse_blue"),
+    **{
+        axis: (axis, f"points:{k}", f"points_m_xyz:{k}", f"cartesian{axis}", f"coord_{axis}", other)
+        for k, (axis, other) in enumerate(zip("xyz", ("easting", "northing", "elevation"), strict=True))
+    },
+    **{
+        f"n{axis}": (f"n{axis}", f"normal_{axis}", f"normal{axis}", f"n_{axis}", f"normals:{k}")
+        for k, axis in enumerate("xyz")
+    },
+    **{c: (c, c[0], f"{c[0]}f", f"diffuse_{c}", f"color{c}") for c in ("red", "green", "blue")},
 }
 _GROUPS = {"points": ("x", "y", "z"), "normals": ("nx", "ny", "nz"), "colors": ("red", "green", "blue")}
 
@@ -43,21 +43,25 @@ class RawCloud:
         normals: (N, 3) as stored, any length, or None.
         colors: (N, 3) in [0, 1], or None.
         faces: (M, 3) triangles as rows of ``points``, or None for a cloud.
-        unread: names of what else the file says of its points, such as intensity.
+        fields: whatever other numbers (N,) the file holds for each point, such as intensity, by name and in
+            the type of the file.
+        unread: names of what else the file says and nothing here holds.
     """
 
     points: FloatArray
     normals: FloatArray | None = None
     colors: FloatArray | None = None
     faces: IntArray | None = None
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
 
     def take(self, rows: NDArray[np.bool_]) -> RawCloud:
-        """The points of a mask with their normals and colours; faces are given up."""
+        """The points of a mask with all that belongs to them; faces are given up."""
         return RawCloud(
             self.points[rows],
             None if self.normals is None else self.normals[rows],
             None if self.colors is None else self.colors[rows],
+            fields={name: values[rows] for name, values in self.fields.items()},
             unread=self.unread,
         )
 
@@ -77,58 +81,90 @@ def columns_by_name(names: Sequence[str]) -> dict[str, list[int]]:
     return found
 
 
-def unread_names(names: Sequence[str], groups: Mapping[str, Sequence[int]]) -> tuple[str, ...]:
-    """Names of the columns that are in no group."""
-    read = {column for columns in groups.values() for column in columns}
-    return tuple(name for column, name in enumerate(names) if column not in read)
+def cloud_of(
+    names: Sequence[str],
+    columns: Sequence[NDArray[Any]],
+    *,
+    faces: IntArray | None = None,
+    unread: tuple[str, ...] = (),
+) -> RawCloud:
+    """A cloud of named columns (N,), among them x, y and z; what has no role becomes a field.
+
+    Colours that `scale_colors` cannot make sense of are fields too. Of columns with equal names the first
+    counts, the others are named as unread.
+    """
+    groups = columns_by_name(names)
+    parts = {group: np.stack([columns[k] for k in chosen], axis=1) for group, chosen in groups.items()}
+    colors = scale_colors(parts["colors"]) if "colors" in parts else None
+    if "colors" in groups and colors is None:
+        del groups["colors"]
+    used = {k for chosen in groups.values() for k in chosen}
+    fields: dict[str, NDArray[Any]] = {}
+    for k, (name, column) in enumerate(zip(names, columns, strict=True)):
+        if k not in used and name in fields:
+            unread = (*unread, f"{name} (column {k + 1})")
+        elif k not in used:
+            fields[name] = np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("="))
+    return RawCloud(
+        np.asarray(parts["points"], dtype=np.float64),
+        np.asarray(parts["normals"], dtype=np.float64) if "normals" in parts else None,
+        colors,
+        faces,
+        fields,
+        unread,
+    )
 
 
-def split_columns(table: FloatArray, names: Sequence[str] | None) -> RawCloud:
+def split_columns(table: FloatArray, names: Sequence[str] | None, what: str) -> RawCloud:
     """Columns of a text table or an array file, by name or, without names, by this rule.
 
-    The first three are x, y, z. Of exactly six (or nine) columns, each further triple is taken as normals
-    when at least 99 % of its rows are of length 1 within 0.01, else as colours when all its values lie in
-    [0, 255]; a triple that is neither, a second one of the same kind, and all columns of other counts
-    are ignored.
+    The first three are x, y, z. Of exactly six (or nine) columns, the first further triple of which at least
+    99 % of the rows are of length 1 within 0.01 is taken as normals, unless it holds only zeros and ones.
+    All others are fields: values that could be colours could as well be intensity, ring and time.
+
+    Raises:
+        FormatError: no names, and the first column counts the rows like a point number.
     """
-    if names is not None:
-        groups = columns_by_name(names)
-    else:
-        groups = {"points": [0, 1, 2]}
-        if table.shape[1] in (6, 9):
-            for first in range(3, table.shape[1], 3):
-                role = _guess_role(table[:, first : first + 3])
-                if role is not None:
-                    groups.setdefault(role, [first, first + 1, first + 2])
-    points = table if table.shape[1] == 3 else np.ascontiguousarray(table[:, groups["points"]])
-    normals = table[:, groups["normals"]] if "normals" in groups else None
-    colors = scale_colors(table[:, groups["colors"]]) if "colors" in groups else None
-    named = names if names is not None else [f"column {k + 1}" for k in range(table.shape[1])]
-    return RawCloud(points, normals, colors, unread=unread_names(named, groups))
+    if names is None:
+        if _counts_rows(table):
+            raise FormatError(
+                f"{what}: the first column rises in whole numbers from {table[0, 0]:.0f} to "
+                f"{table[-1, 0]:.0f}, as point numbers do, and nothing says what it is; name the columns in "
+                "a first line such as 'id x y z' (or 'x y z ...', if it is x), or remove it"
+            )
+        names = ["x", "y", "z", *(f"column_{k}" for k in range(4, table.shape[1] + 1))]
+        for first in range(3, table.shape[1], 3) if table.shape[1] in (6, 9) else ():
+            if _looks_like_normals(table[:, first : first + 3]):
+                names[first : first + 3] = ["nx", "ny", "nz"]
+                break
+    return cloud_of(names, list(table.T))
 
 
-def _guess_role(triple: FloatArray) -> str | None:
+def _counts_rows(table: FloatArray) -> bool:
+    """Whether the first of four or more columns is whole and rises in every row: by one step, or in many."""
+    if table.shape[1] < 4 or len(table) < 3:
+        return False
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(table[:, 0])
+        whole = np.isfinite(table[:, 0]).all() and (table[:, 0] == np.rint(table[:, 0])).all()
+    return bool(whole and steps.min() > 0 and (len(table) >= 10 or steps.min() == steps.max()))
+
+
+def _looks_like_normals(triple: FloatArray) -> bool:
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(triple[np.isfinite(triple).all(axis=1)], axis=1)
-    if len(lengths) and np.mean(np.abs(lengths - 1.0) <= 0.01) >= 0.99:
-        return "normals"
-    if len(triple) and np.nanmin(triple, initial=0.0) >= 0 and np.nanmax(triple, initial=0.0) <= 255:
-        return "colors"
-    return None
+    flags = bool(((triple == 0) | (triple == 1)).all())  # classes, one column each
+    return not flags and len(lengths) > 0 and bool(np.mean(np.abs(lengths - 1.0) <= 0.01) >= 0.99)
 
 
-def scale_colors(values: NDArray[Any], stored: str | None = None) -> FloatArray | None:
+def scale_colors(values: NDArray[Any]) -> FloatArray | None:
     """Colours (N, 3) in [0, 1] from whatever a file stores.
 
     8 bit integers are divided by 255. Otherwise the largest value decides: up to 1 (floats only) they are
     fractions already, up to 255 they are divided by 255, up to 65535 by 65535. Negative, non-finite or
     larger values are no colours: None.
-
-    Args:
-        values: (N, 3) numbers.
-        stored: numpy name of the type the file declares, where it is not that of ``values``.
     """
-    kind = np.dtype(stored) if stored is not None else values.dtype
+    kind = values.dtype
     if not len(values):
         return None
     low, high = float(values.min()), float(values.max())
@@ -144,33 +180,31 @@ def scale_colors(values: NDArray[Any], stored: str | None = None) -> FloatArray 
     return colors
 
 
-def read_columns(
-    handle: BinaryIO, dtype: np.dtype[Any], count: int, groups: Mapping[str, Sequence[int]]
-) -> dict[str, NDArray[Any]]:
-    """Read ``count`` fixed-size rows chunk by chunk and keep only the wanted fields.
+def storable_fields(
+    cloud: RawCloud, types: Container[str], taken: set[str]
+) -> tuple[dict[str, NDArray[Any]], tuple[str, ...]]:
+    """The fields of a cloud in types that a format has, and the names of those that it cannot hold.
+
+    Whole numbers too wide for the format become doubles where that changes none. Blanks in names become _.
 
     Args:
-        handle: file at the first row; must hold ``count`` rows (the caller has checked the size).
-        dtype: the row; fields are addressed by position.
-        groups: for each name the fields that become the columns of its array.
-
-    Returns:
-        (count, number of fields) per group: float64 for points and normals, the stored type otherwise.
+        cloud: its fields are asked about.
+        types: what the format can store, such as "f4" or "u2".
+        taken: names that are in use already, lower case.
     """
-    fields = dtype.names or ()
-    out: dict[str, NDArray[Any]] = {}
-    for group, columns in groups.items():
-        stored = np.result_type(*(dtype[fields[column]] for column in columns)).newbyteorder("=")
-        kind = np.dtype(np.float64) if group in ("points", "normals") else stored
-        out[group] = np.empty((count, len(columns)), dtype=kind)
-    rows = max(1, CHUNK_BYTES // dtype.itemsize)
-    for start in range(0, count, rows):
-        block = np.fromfile(handle, dtype=dtype, count=min(rows, count - start))
-        with np.errstate(invalid="ignore"):  # signalling NaNs are dropped later
-            for group, columns in groups.items():
-                for k, column in enumerate(columns):
-                    out[group][start : start + len(block), k] = block[fields[column]]
-    return out
+    kept: dict[str, NDArray[Any]] = {}
+    lost: list[str] = []
+    for name, values in cloud.fields.items():
+        plain = re.sub(r"\s+", "_", name)
+        if values.dtype.str[1:] not in types:
+            wider = values.astype(np.float32 if values.dtype == np.float16 else np.float64)
+            values = wider if np.array_equal(wider.astype(values.dtype), values, equal_nan=True) else values
+        if values.dtype.str[1:] in types and plain.lower() not in taken:
+            kept[plain] = values
+            taken.add(plain.lower())
+        else:
+            lost.append(name)
+    return kept, tuple(lost)
 
 
 def chunks(num_rows: int, row_bytes: int) -> Iterator[slice]:
@@ -193,3 +227,9 @@ def header_count(text: str, path: Path, what: str) -> int:
     if not 0 <= count < 1 << 40:
         raise FormatError(f"'{path}': the header's {what} '{text}' is no usable count")
     return count
+
+
+def wrong_count(path: Path, said: int, held: int, what: str = "points") -> FormatError:
+    """A header's count that the content does not bear out."""
+    reason = "it is truncated or its header is wrong" if held < said else "its header is wrong"
+    return FormatError(f"'{path}': the header says {said} {what}, the file holds {held}; {reason}")

@@ -259,7 +259,7 @@ def test_identity_follows_shards_settings_and_seed(shards: Path, tmp_path: Path)
 
 def test_training_reads_the_folder(shards: Path) -> None:
     from geomoe3d.training.batches import open_training, training_loader
-    from geomoe3d.training.config import TrainConfig
+    from geomoe3d.training.config import TrainConfig, load_train_config
 
     config = TrainConfig.model_validate(
         {"batch_size": 2, "steps": 2, "data": {"train": str(shards), "correspondences": 200}}
@@ -269,6 +269,12 @@ def test_training_reads_the_folder(shards: Path) -> None:
     batches = list(training_loader(config, pairs, 0))
     assert len(batches) == 2
     assert batches[0].labels.shape == (2, 200)
+    drawn = open_training(
+        load_train_config(
+            None, [f"data.train={shards}", "data.draw.usual_keypoints=150", "data.draw.usual_share=1"]
+        )
+    )[0]
+    assert len(drawn) == 150
 
 
 def test_augmented_pair_keeps_its_labels(shards: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError, FormatError, InputError, OutputError
+from geomoe3d.geometry.se3 import rotation_error_deg
 from geomoe3d.training.augment import AugmentationConfig, augment
 from geomoe3d.training.batches import StepSampler, TrainingSamples, make_batch, open_training
 from geomoe3d.training.config import TrainConfig, load_train_config
@@ -138,6 +139,19 @@ def test_augmentation_keeps_labels_true_and_rows_together() -> None:
     assert 0.005 < shift <= 0.0101
     same = augment(tagged, AugmentationConfig(jitter=0, rotate=False, swap=0), None, np.random.default_rng(0))
     assert equal(same, tagged)
+
+
+def test_the_target_alone_is_turned_and_no_further_than_asked() -> None:
+    pair = SyntheticPairs(SyntheticConfig(voxel_size=(0.1, 0.1)))[0]
+    config = AugmentationConfig(swap=0, jitter=0, turned="target", largest_rotation_deg=30)
+    angles = []
+    for seed in range(30):
+        changed = augment(pair, config, None, np.random.default_rng(seed))
+        angles.append(rotation_error_deg(changed.T_target_source, pair.T_target_source))
+        source, before = changed.correspondences[:, :3], pair.correspondences[:, :3]
+        np.testing.assert_allclose(source - source[0], before - before[0], atol=1e-5)
+        np.testing.assert_allclose(residual(changed), residual(pair), atol=1e-4)
+    assert 20 < max(angles) <= 30
 
 
 def test_shards_give_back_what_was_written(tmp_path: Path) -> None:

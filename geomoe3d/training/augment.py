@@ -1,12 +1,14 @@
 """Random changes of a training pair that keep its labels right, or nearly so (`bend`).
 
-Clouds turned by any rotation and moved, roles exchanged, coordinates jittered, bent as a drifting sensor
-bends them, correspondences left out. Scale needs none: the network divides by the voxel size.
+One or both clouds turned by any rotation, or up to an angle, and moved, roles exchanged, coordinates
+jittered, bent as a drifting sensor bends them, correspondences left out. Scale needs none:
+the network divides by the voxel size.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,7 +23,14 @@ from geomoe3d.types import FloatArray
 class AugmentationConfig(Section):
     """What may happen to a pair."""
 
-    rotate: bool = Field(True, description="turn each cloud by a uniform random rotation")
+    rotate: bool = Field(True, description="turn the clouds by random rotations, as the next two keys say")
+    turned: Literal["both", "target"] = Field("both", description="which clouds are turned")
+    largest_rotation_deg: float = Field(
+        180.0,
+        gt=0,
+        le=180,
+        description="largest angle, about any axis, angles evenly up to it; 180: uniform over rotations",
+    )
     swap: float = Field(0.5, ge=0, le=1, description="chance that source and target change roles")
     jitter: float = Field(0.1, ge=0, description="largest shift of a coordinate, in voxels")
     bend: float = Field(
@@ -51,7 +60,9 @@ def augment(
     if config.rotate:
         # About each cloud's middle: origins far away would cost digits.
         middles = [half.mean(axis=0) for half in halves]
-        A, B = (Rotation.from_quat(rng.normal(size=4)).as_matrix() for _ in range(2))
+        A, B = (_turn(config.largest_rotation_deg, rng) for _ in range(2))
+        if config.turned == "target":
+            A = np.eye(3)
         halves = [(halves[0] - middles[0]) @ A.T, (halves[1] - middles[1]) @ B.T]
         R = B @ T[:3, :3] @ A.T
         T = make_transform(R, B @ (T[:3, :3] @ middles[0] + T[:3, 3] - middles[1]))
@@ -61,6 +72,15 @@ def augment(
     if config.jitter:
         points = points + rng.uniform(-config.jitter, config.jitter, points.shape) * pair.voxel_size
     return replace(pair, correspondences=points.astype(np.float32), T_target_source=T)
+
+
+def _turn(largest_deg: float, rng: np.random.Generator) -> FloatArray:
+    """A random rotation (3, 3) of at most so many degrees."""
+    if largest_deg == 180:
+        return Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    axis = rng.normal(size=3)
+    angle = np.radians(largest_deg) * rng.random()
+    return Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
 
 
 def _bent(points: FloatArray, most: float, voxel_size: float, rng: np.random.Generator) -> FloatArray:

@@ -89,7 +89,7 @@ def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
     if where == "synthetic":
         return SyntheticPairs(data.synthetic, seed)
     if Path(where).is_dir() and any(is_shard(path) for path in Path(where).iterdir()):
-        return FragmentPairs(where, seed=seed, verify=True)
+        return FragmentPairs(where, data.draw, seed, verify=True)
     return ShardFolder(where)
 
 

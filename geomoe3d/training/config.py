@@ -11,6 +11,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from geomoe3d.config import Section, build_config, read_yaml, set_keys
+from geomoe3d.data.draw import DrawSettings
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.training.augment import AugmentationConfig
 from geomoe3d.training.losses import LossConfig
@@ -34,6 +35,9 @@ class DataConfig(Section):
     )
     prefetch: int = Field(4, ge=1, description="batches that each worker prepares ahead")
     synthetic: SyntheticConfig = SyntheticConfig()
+    draw: DrawSettings = Field(
+        DrawSettings(), description="which pairs of described fragments are drawn, and how"
+    )
     augmentation: AugmentationConfig = AugmentationConfig()
 
 

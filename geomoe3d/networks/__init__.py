@@ -1,1 +1,1 @@
-"""GeoMoE and its parts: architecture, blocks, inputs, inference, weights on disk."""
+"""GeoMoE, its baselines and their parts: architecture, blocks, inputs, inference, weights on disk."""

@@ -7,13 +7,40 @@ chosen and why. Lengths are in voxels, so that one set of weights serves any uni
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from geomoe3d.config import Section
 
 ExtraChannel = Literal["compatibility", "hypothesis", "feature_distance", "ratio", "mutual", "aligned"]
+
+Kind = Literal["geomoe", "pointcn", "oanet", "umatch", "dematch", "demo", "pointdsc"]
+
+_PUBLISHED: dict[str, dict[str, Any]] = {
+    "pointcn": {"num_layers": 12, "motion_form": "endpoints"},
+    "oanet": {"num_layers": 2, "num_sub_fields": 500, "motion_form": "endpoints"},
+    "umatch": {"num_layers": 6, "motion_form": "endpoints"},
+    "dematch": {"num_layers": 5},
+    "demo": {"num_layers": 4},
+    "pointdsc": {"num_layers": 12, "motion_form": "endpoints"},
+}
+"""Of each baseline, what differs from GeoMoE's defaults."""
+
+_USED: dict[str, tuple[str, ...]] = {
+    "pointcn": ("motion_form",),
+    "oanet": ("motion_form", "num_sub_fields"),
+    "umatch": ("motion_form", "num_heads"),
+    "dematch": ("num_heads", "num_sub_fields"),
+    "demo": (
+        "motion_form", "num_heads", "num_sub_fields", "num_neighbors", "context_width", "embedding_norm",
+        "knn_space",
+    ),
+    "pointdsc": ("motion_form", "compatibility_threshold"),
+}  # fmt: skip
+"""Of each baseline, the keys that mean something to it, beside those that mean something to all."""
+
+_USED_BY_ALL = ("kind", "num_layers", "width", "unit_voxels")
 
 CHANNEL_WIDTHS: dict[str, int] = {
     "compatibility": 4,
@@ -26,8 +53,12 @@ CHANNEL_WIDTHS: dict[str, int] = {
 
 
 class NetworkConfig(Section):
-    """Size, wiring and input form of `geomoe3d.networks.geomoe.GeoMoE`."""
+    """Size, wiring and input form of `geomoe3d.networks.geomoe.GeoMoE`, or of one of its baselines.
 
+    A baseline (``kind``) has its published sizes as defaults, and refuses keys that mean nothing to it.
+    """
+
+    kind: Kind = Field("geomoe", description="architecture; the other keys are GeoMoE's")
     correspondence_dim: Literal[4, 6] = Field(6, description="6: two 3D points, 4: two image points")
     num_layers: int = Field(8, ge=1)
     width: int = Field(128, ge=4, description="channels D of the motion field")
@@ -74,6 +105,30 @@ class NetworkConfig(Section):
     )
     compatibility_anchors: int = Field(512, ge=8, description="columns compared with beyond that")
     hypothesis_size: int = Field(20, ge=3, description="correspondences in a local hypothesis")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_published_sizes(cls, values: Any) -> Any:
+        kind = values.get("kind") if isinstance(values, dict) else None
+        if kind not in _PUBLISHED:
+            return values
+        return {"feed_forward": "none", **_PUBLISHED[kind], **values}
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> NetworkConfig:
+        if self.kind == "geomoe":
+            return self
+        expected = {"feed_forward": "none", **_PUBLISHED[self.kind]}
+        for name, of_key in type(self).model_fields.items():
+            given = getattr(self, name)
+            if name in (*_USED_BY_ALL, *_USED[self.kind]) or given == expected.get(name, of_key.default):
+                continue
+            raise ValueError(f"{name}={given} means nothing to the network '{self.kind}'; leave it out")
+        if self.motion_form == "none":
+            raise ValueError(
+                f"the network '{self.kind}' needs coordinates: motion_form difference or endpoints"
+            )
+        return self
 
     @model_validator(mode="after")
     def _check(self) -> NetworkConfig:

@@ -57,6 +57,7 @@ class GeoMoEOutput:
         kept_fraction: (L,) share of correspondences with a positive logit.
         insights: one per layer if asked for, else empty.
         verdict: (B,) logit that the motion of each field is right, or None for a network that is given none.
+        similarity: (B, N, N) in [0, 1], how alike the features of two rows are, from PointDSC; else None.
     """
 
     logits: Tensor
@@ -66,6 +67,7 @@ class GeoMoEOutput:
     kept_fraction: Tensor
     insights: tuple[LayerInsight, ...] = ()
     verdict: Tensor | None = None
+    similarity: Tensor | None = None
 
 
 class GeoMoE(nn.Module):

@@ -15,6 +15,7 @@ from typing import Any
 from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, ConfigError
 from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.build import Network, build_network
 from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.networks.weight_files import find_weights
 from geomoe3d.runtime.files import check_output, write_atomically, write_text
@@ -50,7 +51,7 @@ class WeightCard:
 
 
 def save_pretrained(
-    path: str | Path, model: GeoMoE, card: WeightCard, *, force: bool = False, half: bool = False
+    path: str | Path, model: Network, card: WeightCard, *, force: bool = False, half: bool = False
 ) -> WeightCard:
     """Write ``path`` (.safetensors) and its card (.json beside it).
 
@@ -92,7 +93,20 @@ def save_pretrained(
 
 
 def load_pretrained(name_or_path: str | Path) -> tuple[GeoMoE, WeightCard]:
-    """A network in evaluation mode, on the CPU, and its card.
+    """A GeoMoE in evaluation mode, and its card; see `load_network`.
+
+    Raises:
+        CheckpointError: as there, and for weights of another architecture.
+    """
+    model, card = load_network(name_or_path)
+    if not isinstance(model, GeoMoE):
+        kind = model.config.kind
+        raise CheckpointError(f"'{name_or_path}' holds weights of '{kind}', not of 'geomoe': give that name")
+    return model, card
+
+
+def load_network(name_or_path: str | Path) -> tuple[Network, WeightCard]:
+    """Any network in evaluation mode, on the CPU, and its card.
 
     Args:
         name_or_path: a .safetensors file with its card beside it, or the name of weights that ship with
@@ -121,7 +135,7 @@ def load_pretrained(name_or_path: str | Path) -> tuple[GeoMoE, WeightCard]:
         tensors = load(data)
     except (ConfigError, SafetensorError) as error:
         raise CheckpointError(f"'{path}': {error}") from None
-    model = GeoMoE(config)
+    model = build_network(config)
     expected = model.state_dict()
     missing, extra = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     shaped = [n for n in expected.keys() & tensors.keys() if expected[n].shape != tensors[n].shape]

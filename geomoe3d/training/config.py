@@ -104,6 +104,10 @@ class TrainConfig(Section):
                 "a network that judges motions is trained with data.augmentation.rotate=false, swap=0 and "
                 "jitter=0: its channels do not change with rotation, and the others would not fit the motions"
             )
+        if self.checkpoint_activations and self.network.kind != "geomoe":
+            raise ValueError(
+                f"checkpoint_activations is for GeoMoE, not for '{self.network.kind}'; leave it out"
+            )
         if self.validation.best_metric == "verdict" and not self.network.judges_motions:
             raise ValueError("validation.best_metric=verdict is for networks that judge motions")
         return self

@@ -45,6 +45,7 @@ class LossConfig(Section):
         description="of an inlier beside an outlier in the plain form; a logit is 0 at odds of 1 to it",
     )
     verdict_weight: float = Field(1.0, ge=0, description="of the verdict, for networks that judge motions")
+    similarity_weight: float = Field(1.0, ge=0, description="of features being alike, for PointDSC")
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Losses:
         balance: scalar, mean over layers.
         num_unsolved: layer-pairs left out of the regression because their weights fix no motion.
         verdict: scalar, 0 for a network that judges no motions.
+        similarity: scalar, 0 for a network that compares no features.
     """
 
     total: Tensor
@@ -66,6 +68,22 @@ class Losses:
     balance: Tensor
     num_unsolved: Tensor
     verdict: Tensor
+    similarity: Tensor
+
+
+def similarity_loss(similarity: Tensor, labels: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean square of similarity (B, N, N) minus 1 where both rows are inliers (B, N), 0 elsewhere.
+
+    Source: the spectral matching loss of PointDSC (Bai et al., CVPR 2021), plain form; the diagonal is 0.
+    """
+    inlier = labels.float()
+    wanted = inlier[:, :, None] * inlier[:, None]
+    wanted = wanted * (1 - torch.eye(labels.shape[1], device=labels.device))
+    square = (similarity.float() - wanted).square()
+    if mask is None:
+        return square.mean()
+    both = (mask[:, :, None] & mask[:, None]).float()
+    return ((square * both).sum((1, 2)) / both.sum((1, 2))).mean()
 
 
 def verdict_loss(verdict: Tensor, right: Tensor, pair: Tensor) -> Tensor:
@@ -227,4 +245,8 @@ def total_loss(
     if output.verdict is not None and right is not None and pair is not None:
         verdict = verdict_loss(output.verdict, right, pair)
         total = total + config.verdict_weight * verdict
-    return Losses(total, classification, regression, output.balance, unsolved, verdict)
+    similarity = classification.new_zeros(())
+    if output.similarity is not None:
+        similarity = similarity_loss(output.similarity, labels, mask)
+        total = total + config.similarity_weight * similarity
+    return Losses(total, classification, regression, output.balance, unsolved, verdict, similarity)

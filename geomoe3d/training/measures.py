@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from geomoe3d.geometry.kabsch import weighted_kabsch
-from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.build import Network
 from geomoe3d.networks.layers import weights_from_logits
 from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch
 
@@ -54,7 +54,7 @@ def measure_batch(logits: Tensor, batch: Batch, unit_voxels: float) -> dict[str,
 
 @torch.no_grad()
 def evaluate(
-    model: GeoMoE, samples: list[Sample], device: torch.device, batch_size: int = 8
+    model: Network, samples: list[Sample], device: torch.device, batch_size: int = 8
 ) -> dict[str, float]:
     """Mean measures over samples, with the model in evaluation mode (and put back).
 

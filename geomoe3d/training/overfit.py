@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from geomoe3d.networks.geomoe import GeoMoE
+from geomoe3d.networks.build import build_network
 from geomoe3d.training.batches import TrainingSamples, make_batch, open_training
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.distributed import Process, choose_device
@@ -35,7 +35,7 @@ def overfit_one_batch(
     torch.manual_seed(config.seed)
     samples = TrainingSamples(open_training(config), config)
     batch = make_batch([samples[i] for i in range(config.batch_size)])
-    model = GeoMoE(config.network).to(device).train()
+    model = build_network(config.network).to(device).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.0)
     updater = Updater(model, model, optimizer, config.model_copy(update={"accumulation": 1}))
     f1 = 0.0

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from geomoe3d.networks.geomoe import GeoMoE, GeoMoEOutput
+from geomoe3d.networks.build import Network, build_network
+from geomoe3d.networks.geomoe import GeoMoEOutput
 from geomoe3d.training.batches import Batch
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.losses import Losses, total_loss
@@ -51,7 +52,7 @@ class Updater:
     """Accumulates gradients over micro-batches and updates the weights if they are finite."""
 
     def __init__(
-        self, model: GeoMoE, wrapped: nn.Module, optimizer: torch.optim.Optimizer, config: TrainConfig
+        self, model: Network, wrapped: nn.Module, optimizer: torch.optim.Optimizer, config: TrainConfig
     ) -> None:
         self.model = model
         self.wrapped = wrapped
@@ -105,15 +106,15 @@ class Updater:
 class AveragedWeights:
     """Exponential moving average of parameters; running statistics are copied."""
 
-    def __init__(self, model: GeoMoE, decay: float) -> None:
+    def __init__(self, model: Network, decay: float) -> None:
         self.decay = decay
-        self.model = GeoMoE(model.config).to(next(model.parameters()).device)
+        self.model = build_network(model.config).to(next(model.parameters()).device)
         self.model.load_state_dict(model.state_dict())
         self.model.eval().requires_grad_(False)
         self.num_updates = 0
 
     @torch.no_grad()
-    def update(self, model: GeoMoE) -> None:
+    def update(self, model: Network) -> None:
         """After a step; young averages forget faster."""
         self.num_updates += 1
         decay = min(self.decay, (1 + self.num_updates) / (10 + self.num_updates))

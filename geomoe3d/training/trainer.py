@@ -20,8 +20,8 @@ import torch
 from torch.nn.parallel import DistributedDataParallel
 
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
-from geomoe3d.networks.geomoe import GeoMoE
-from geomoe3d.networks.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.networks.build import Network, build_network
+from geomoe3d.networks.pretrained import WeightCard, load_network, save_pretrained
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples
@@ -72,7 +72,7 @@ class TrainingRun:
         if config.data.validation == "synthetic" != config.data.train:
             self.notes.append("the best weights are chosen on generated pairs: give data.validation as well")
         torch.manual_seed(config.seed)
-        self.model = GeoMoE(config.network)
+        self.model = build_network(config.network)
         if config.init_from is not None and not self.last_path.exists():
             self._start_from(config.init_from)
         self.model.checkpoint_activations = config.checkpoint_activations
@@ -172,7 +172,7 @@ class TrainingRun:
         )
 
     @property
-    def shipped(self) -> GeoMoE:
+    def shipped(self) -> Network:
         """The network that is validated and exported: averaged weights if they are kept."""
         return self.model if self.averaged is None else self.averaged.model
 
@@ -237,7 +237,7 @@ class TrainingRun:
         self.notes.append(f"goes on from step {self.progress.step} of '{self.last_path}'")
 
     def _start_from(self, path: str) -> None:
-        model, _ = load_pretrained(path)
+        model, _ = load_network(path)
         if model.config != self.config.network:
             raise CheckpointError(
                 f"'{path}' holds another architecture than the configuration asks for: "
@@ -247,7 +247,7 @@ class TrainingRun:
 
     def _finish(self) -> Path:
         best = load_checkpoint(self.best_path)
-        model = GeoMoE(self.config.network)
+        model = build_network(self.config.network)
         model.load_state_dict(best["model"])
         card = WeightCard(
             architecture={},

@@ -54,6 +54,7 @@ REQUIRED_MODULES = {
     "rich": "rich>=13.7",
     "safetensors": "safetensors>=0.4.3",
     "matplotlib": "matplotlib>=3.8",
+    "jinja2": "jinja2>=3.1",
     "trimesh": "trimesh>=4.4",
     "small_gicp": "small_gicp>=1.0",
     "threadpoolctl": "threadpoolctl>=3.1",

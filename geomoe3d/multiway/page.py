@@ -7,19 +7,19 @@ any network, and lists every scan and its fate in plain HTML. At most 300,000 po
 from __future__ import annotations
 
 import colorsys
-import html
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from geomoe3d.clouds.io import load_points
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
 from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.page import base64_floats, fill_page
 from geomoe3d.visual.scene import thin
+from geomoe3d.visual.templates import base64_floats, render_cloud_page
 from geomoe3d.visual.upright import upright_axes
 
 MAX_POINTS = 300_000
@@ -59,14 +59,17 @@ def render_model_page(model: SceneModel) -> str:
         "spacing": max(model.voxel_size, radius / 300),
     }
     placed = sum(len(group.poses) for group in model.groups)
+    doubtful = [edge for edge in model.edges if not edge.kept and edge.confidence > 0.5]
     values = {
-        "generator": PAGE_MARK,
+        "generator": Markup(PAGE_MARK),
         "title": f"{placed} of {len(model.scans)} scans placed",
         "summary": _summary(model, placed),
-        "scans": _scan_list(model, colors),
-        "edges": _edge_list(model),
+        "groups": model.groups,
+        "colors": colors,
+        "unplaced": model.unplaced,
+        "doubtful": sorted(doubtful, key=lambda edge: -edge.confidence),
     }
-    return fill_page("geomoe3d.multiway", "page", values, data)
+    return render_cloud_page("multiway", "page", values, data)
 
 
 def _clouds(model: SceneModel, colors: dict[str, str]) -> tuple[list[dict[str, Any]], dict[str, FloatArray]]:
@@ -121,41 +124,10 @@ def _lines(model: SceneModel, centers: dict[str, FloatArray]) -> dict[str, Any]:
 def _summary(model: SceneModel, placed: int) -> str:
     kept = sum(edge.kept for edge in model.edges)
     groups = f" in {len(model.groups)} groups that nothing sure connects" if len(model.groups) > 1 else ""
-    return html.escape(
+    return (
         f"{placed} of {len(model.scans)} scans placed{groups}. {model.num_pairs} pairs registered, {kept} "
         f"edges kept. Common voxel size {model.voxel_size:.4g}."
     )
-
-
-def _scan_list(model: SceneModel, colors: dict[str, str]) -> str:
-    parts = []
-    for count, group in enumerate(model.groups, start=1):
-        items = "".join(
-            f'<li><label><input type="checkbox" data-scan="{html.escape(name)}" checked> '
-            f'<i style="background:{colors[name]}"></i>{html.escape(name)}</label></li>'
-            for name in group.poses
-        )
-        parts.append(f"<h2>Group {count}: {len(group.poses)} scans</h2><ul>{items}</ul>")
-    if model.unplaced:
-        items = "".join(
-            f"<li><b>{html.escape(name)}</b><br>{html.escape(reason)}</li>"
-            for name, reason in model.unplaced.items()
-        )
-        parts.append(f'<h2>Not placed: {len(model.unplaced)}</h2><ul class="reasons">{items}</ul>')
-    return "".join(parts)
-
-
-def _edge_list(model: SceneModel) -> str:
-    """The edges that looked good and were rejected all the same."""
-    doubtful = [edge for edge in model.edges if not edge.kept and edge.confidence > 0.5]
-    if not doubtful:
-        return ""
-    items = "".join(
-        f"<li><b>{html.escape(e.source)} → {html.escape(e.target)}</b> confidence {e.confidence:.2f}<br>"
-        f"{html.escape(e.reason)}</li>"
-        for e in sorted(doubtful, key=lambda e: -e.confidence)[:100]
-    )
-    return f'<h2>Rejected though confident: {len(doubtful)}</h2><ul class="reasons">{items}</ul>'
 
 
 def _color(number: int) -> str:

@@ -3,26 +3,21 @@
 The page asks nothing of any network: style, script and points are inside it, and its own content security
 policy forbids everything else. It draws with WebGL 2 and falls back to a plain canvas. The numbers are in
 the HTML itself, readable without script. Cost: about a second; at most 50,000 points per cloud are
-embedded, so the file stays under 3 MB however large the clouds are. `fill_page` makes the other pages with
-clouds to turn, too: a model of many scans, the report of an evaluation.
+embedded, so the file stays under 3 MB however large the clouds are.
 """
 
 from __future__ import annotations
 
 import base64
-import html
-import json
 import os
-import re
-from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.files import check_output, write_text
 from geomoe3d.types import FloatArray, IntArray
 from geomoe3d.visual.paper import number
 from geomoe3d.visual.scene import (
@@ -35,6 +30,7 @@ from geomoe3d.visual.scene import (
     choose_rows,
     distance_to_target,
 )
+from geomoe3d.visual.templates import base64_floats, render_cloud_page
 from geomoe3d.visual.view import RegistrationView
 
 MAX_POINTS = 50_000
@@ -52,11 +48,8 @@ def save_page(view: RegistrationView, path: str | os.PathLike[str], *, force: bo
     Raises:
         OutputError: the file exists and ``force`` is False, or it cannot be written.
     """
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(render_page(view), encoding="utf-8", newline="\n")
-
-    write_atomically(path, write, force=force)
+    check_output(path, force=force)
+    write_text(path, render_page(view), force=force)
 
 
 def render_page(view: RegistrationView) -> str:
@@ -64,53 +57,21 @@ def render_page(view: RegistrationView) -> str:
     scene = build_scene(view, max_points=MAX_POINTS)
     result = view.result
     source, target = result.source.name, result.target.name
-    made_by = _escape(f"geomoe3d {result.versions.get('geomoe3d', '')}".strip())
+    made_by = f"geomoe3d {result.versions.get('geomoe3d', '')}".strip()
+    status_words = STATUS_WORDS[result.status]
     values = {
-        "generator": f'<meta name="generator" content="{made_by}">',
+        "generator": Markup('<meta name="generator" content="{}">').format(made_by),
         "made_by": made_by,
-        "title": _escape(f"{source} on {target}: {STATUS_WORDS[result.status]}"),
-        "stage_label": _escape(f"Point clouds {source} and {target}, {STATUS_WORDS[result.status]}"),
-        "status": result.status,
-        "status_words": STATUS_WORDS[result.status],
-        "confidence": _escape(f"confidence {number(result.confidence, '.2f')}"),
-        "source_name": _escape(source),
-        "target_name": _escape(target),
-        "reasons": _reasons(view),
-        "transform": _transform(view),
-        "facts": _facts(view, scene),
-        "timings": _timings(view),
-        "drawn": _escape(_drawn(view, scene)),
+        "title": f"{source} on {target}: {status_words}",
+        "stage_label": f"Point clouds {source} and {target}, {status_words}",
+        "result": result,
+        "status_words": status_words,
+        "confidence": f"confidence {number(result.confidence, '.2f')}",
+        "matrices": {key: _shown_matrix(T, result.voxel_size) for key, T in _transforms(view).items()},
+        "tables": {"Numbers": _facts(view), "Time": [(k, f"{s:.3f} s") for k, s in result.seconds.items()]},
+        "drawn": _drawn(view, scene),
     }
-    return fill_page("geomoe3d.visual", "page", values, _data(view, scene))
-
-
-def fill_page(package: str, name: str, values: dict[str, str], data: dict[str, Any]) -> str:
-    """The text of a self-contained page with clouds to turn.
-
-    Args:
-        package: with ``name``.html (the inside of the body), ``name``.css and ``name``.js.
-        name: of these files.
-        values: HTML for every {{word}} in the body, and "title" and "generator" for the head.
-        data: for the script, which finds it as JSON in the element "data".
-    """
-    shared = "geomoe3d.visual"
-    parts = {
-        **values,
-        "frame_style": _read(shared, "page_frame.css"),
-        "style": _read(package, f"{name}.css"),
-        "draw_script": _read(shared, "page_draw.js"),
-        "view_script": _read(shared, "page_view.js"),
-        "script": _read(package, f"{name}.js"),
-        "data": _embed_json(data),
-    }
-    template = _read(shared, "page_frame.html").replace("{{body}}", _read(package, f"{name}.html").rstrip())
-    # One pass: a file name that holds {{data}} stays a file name.
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], template)
-
-
-def base64_floats(values: FloatArray) -> str:
-    """Numbers as the scripts unpack them: little-endian float32 in base64."""
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
+    return render_cloud_page("visual", "page", values, _data(view, scene))
 
 
 def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
@@ -125,9 +86,6 @@ def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         for name, motion in motions.items()
         if name != "before" and motion is not None
     }
-    matrices = {"answer": result.T_target_source}
-    if result.alternative is not None:
-        matrices["alternative"] = result.alternative.T_target_source
     return {
         "source": {
             "points": base64_floats(scene.source),
@@ -142,7 +100,7 @@ def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         "fits": {name: _fit(scene, T) for name, T in motions.items() if T is not None},
         "distances": distances,
         "distanceLimit": limit,
-        "matrices": {name: _matrix_text(T) for name, T in matrices.items() if np.isfinite(T).all()},
+        "matrices": {name: _matrix_text(T) for name, T in _transforms(view).items()},
         "axes": scene.axes.tolist(),
         "radius": scene.radius,
         "spacing": scene.spacing,
@@ -188,59 +146,25 @@ def _fit(scene: Scene, motion: FloatArray) -> dict[str, Any]:
     return {"center": center.tolist(), "radius": radius}
 
 
-def _reasons(view: RegistrationView) -> str:
-    if not view.result.reasons:
-        return ""
-    items = "".join(f"<li>{_escape(reason)}</li>" for reason in view.result.reasons)
-    return f'<ul class="reasons" aria-label="Reasons">{items}</ul>'
-
-
-def _transform(view: RegistrationView) -> str:
+def _transforms(view: RegistrationView) -> dict[str, FloatArray]:
+    """The answer and the alternative, as far as there are any."""
     result = view.result
-    if not view.has_transform:
-        return (
-            '<section class="transform"><h2>Transform</h2><p><b>No transform was found.</b> '
-            "Only the clouds as their files give them are shown.</p></section>"
-        )
-    text = _matrix(
-        "answer",
-        "Transform",
-        "p<sub>target</sub> = R p<sub>source</sub> + t maps SOURCE into TARGET, "
-        "in the files' own coordinates.",
-        result.T_target_source,
-        result.voxel_size,
-    )
-    other = result.alternative
-    if other is not None and np.isfinite(other.T_target_source).all():
-        text += _matrix(
-            "alternative",
-            "Alternative",
-            f"The best clearly different motion: {other.rotation_difference_deg:.1f}° and "
-            f"{other.translation_difference:.3g} away, "
-            f"its score is {other.relative_score:.2f} of the answer's.",
-            other.T_target_source,
-            result.voxel_size,
-        )
-    return text
+    found = {"answer": result.T_target_source} if view.has_transform else {}
+    if found and result.alternative is not None and np.isfinite(result.alternative.T_target_source).all():
+        found["alternative"] = result.alternative.T_target_source
+    return found
 
 
-def _matrix(key: str, title: str, sentence: str, T: FloatArray, voxel_size: float) -> str:
+def _shown_matrix(T: FloatArray, voxel_size: float) -> list[list[str]]:
     decimals = int(np.clip(np.ceil(3.0 - np.log10(voxel_size)), 0, 9)) if voxel_size > 0 else 6
     cells = [[f"{v:.6f}" for v in row[:3]] + [f"{row[3]:.{decimals}f}"] for row in T[:3]]
-    cells.append(["0", "0", "0", "1"])
-    rows = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in cells)
-    return (
-        f'<section class="transform"><h2>{title}</h2><p>{sentence}</p><div class="matrix" tabindex="0" '
-        f'role="group" aria-label="Matrix of the {title.lower()}"><table>{rows}</table></div>'
-        f'<button type="button" data-copy="{key}">Copy the matrix</button><span class="copied" role="status">'
-        '</span><p class="fine">Rounded here; copied with every digit.</p></section>'
-    )
+    return [*cells, ["0", "0", "0", "1"]]
 
 
-def _facts(view: RegistrationView, scene: Scene) -> str:
+def _facts(view: RegistrationView) -> list[tuple[str, str]]:
     result = view.result
     share = f" ({result.num_inliers / result.num_correspondences:.1%})" if result.num_correspondences else ""
-    rows = [
+    return [
         ("overlap of source", number(result.overlap, ".1%")),
         ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences{share}"),
         ("inlier threshold", f"{result.inlier_threshold:.6g}"),
@@ -249,17 +173,6 @@ def _facts(view: RegistrationView, scene: Scene) -> str:
         ("target points", f"{len(view.target_points):,}"),
         ("seed", str(result.seed)),
     ]
-    return _table("Numbers", rows)
-
-
-def _timings(view: RegistrationView) -> str:
-    rows = [(name, f"{seconds:.3f} s") for name, seconds in view.result.seconds.items()]
-    return _table("Time", rows) if rows else ""
-
-
-def _table(title: str, rows: list[tuple[str, str]]) -> str:
-    body = "".join(f'<tr><th scope="row">{_escape(a)}</th><td>{_escape(b)}</td></tr>' for a, b in rows)
-    return f"<h2>{title}</h2><table>{body}</table>"
 
 
 def _drawn(view: RegistrationView, scene: Scene) -> str:
@@ -297,17 +210,3 @@ def _base64_bytes(values: NDArray[np.float64]) -> str:
     """Values in [0, 1] as 0 to 255; larger ones become 255, NaN becomes 0."""
     levels = np.round(255.0 * np.clip(np.nan_to_num(values, posinf=1.0), 0.0, 1.0)).astype(np.uint8)
     return base64.b64encode(np.ascontiguousarray(levels).tobytes()).decode("ascii")
-
-
-def _embed_json(data: dict[str, Any]) -> str:
-    """JSON for the inside of a script element: no character in it can end the element or open another."""
-    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
-
-
-def _escape(text: str) -> str:
-    return html.escape(text, quote=True)
-
-
-def _read(package: str, name: str) -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")

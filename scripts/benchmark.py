@@ -18,7 +18,7 @@ from pathlib import Path
 from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.predict import MethodSpec, predict
-from geomoe3d.evaluation.report_markdown import benchmark_tables
+from geomoe3d.evaluation.report_text import benchmark_tables
 from geomoe3d.evaluation.study import score_study, write_report
 from geomoe3d.evaluation.task import Task
 from geomoe3d.runtime.files import write_text

@@ -15,9 +15,7 @@ from scipy.stats import norm
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.compare import agresti_min, compare, mcnemar_p
 from geomoe3d.evaluation.records import EvaluationPair, Labels, Prediction, RunInfo, RunScore
-from geomoe3d.evaluation.report_json import to_json
-from geomoe3d.evaluation.report_markdown import to_markdown
-from geomoe3d.evaluation.report_terminal import terminal_table
+from geomoe3d.evaluation.report_text import terminal_table, to_json, to_markdown
 from geomoe3d.evaluation.summary import summarise
 
 NOWHERE = Path("nowhere.ply")

@@ -8,17 +8,22 @@ import re
 from dataclasses import replace
 
 import pytest
+from markupsafe import escape
 from report_runs import NASTY, Document, make_pairs, make_run, predict, report
 
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.evaluation.compare import compare
 from geomoe3d.evaluation.records import EvaluationPair, Measure, Prediction, RunScore
-from geomoe3d.evaluation.report_gallery import worst_failures
-from geomoe3d.evaluation.report_markdown import to_markdown
-from geomoe3d.evaluation.report_page import render_report, run_key, save_report
-from geomoe3d.evaluation.report_plots import is_unrelated
-from geomoe3d.evaluation.report_terminal import terminal_table
-from geomoe3d.evaluation.report_words import MAIN_MEASURES, interval_text, main_row, value_text
+from geomoe3d.evaluation.report_figures import is_unrelated
+from geomoe3d.evaluation.report_page import render_report, run_key, save_report, worst_failures
+from geomoe3d.evaluation.report_text import (
+    COLUMNS,
+    interval_text,
+    main_row,
+    terminal_table,
+    to_markdown,
+    value_text,
+)
 
 
 @pytest.fixture(scope="module")
@@ -93,10 +98,10 @@ def test_columns_are_those_of_the_text_reports(two_runs):
 def test_main_table_row_by_row(two_runs):
     _, rows = main_table(report(*two_runs))
     for (name, cells), (score, _, _) in zip(rows, two_runs, strict=True):
-        assert html.escape(score.info.label, quote=True) in name
+        assert escape(score.info.label) in name
         assert cell_values(cells) == main_row(score)
         intervals = re.findall("<td>.*?(?:<small>(.*?)</small>)?</td>", cells)
-        measures = map(score.measures.get, MAIN_MEASURES)
+        measures = map(score.measures.get, COLUMNS)
         assert intervals == [interval_text(measure) for measure in measures]
 
 

@@ -146,7 +146,7 @@ def compare(first: str, second: str) -> None:
     """Compare two runs pair by pair: who is right where, McNemar's test, ratio of the times."""
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.compare import compare as compare_scores
-    from geomoe3d.evaluation.report_terminal import terminal_comparison
+    from geomoe3d.evaluation.report_text import terminal_comparison
 
     runs = [_score(Path(folder), raw=False) for folder in (first, second)]
     for folder, found in zip((first, second), runs, strict=True):
@@ -222,7 +222,7 @@ def _score(study: Path, *, raw: bool) -> list[StudiedRun]:
 def _print_table(runs: list[StudiedRun]) -> None:
     import shutil
 
-    from geomoe3d.evaluation.report_terminal import terminal_table
+    from geomoe3d.evaluation.report_text import terminal_table
 
     width = shutil.get_terminal_size((0, 0)).columns or None
     color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")

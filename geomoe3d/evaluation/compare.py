@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.errors import InputError
-from geomoe3d.evaluation.intervals import RESAMPLES, Interval, Quantity, Statistic, Z, measure_all, quantile
+from geomoe3d.evaluation.intervals import RESAMPLES, Interval, Quantity, Statistic, measure_all, quantile
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
 from geomoe3d.types import BoolArray, FloatArray
 
@@ -164,10 +164,12 @@ def _difference(found: Measure, a_only: BoolArray, b_only: BoolArray) -> Measure
 
 def agresti_min(a_only: int, b_only: int, count: int) -> Interval:
     """95 % interval in points of the difference of two paired proportions, with half a pair in each cell."""
+    from scipy.stats import norm
+
     n, plus, minus = count + 2.0, a_only + 0.5, b_only + 0.5
     center = (plus - minus) / n
-    half = Z * math.sqrt((plus + minus) / n - center**2) / math.sqrt(n)
-    return 100.0 * max(-1.0, center - half), 100.0 * min(1.0, center + half)
+    low, high = norm.interval(0.95, center, math.sqrt(((plus + minus) / n - center**2) / n))
+    return 100.0 * max(-1.0, float(low)), 100.0 * min(1.0, float(high))
 
 
 def _notes(a: RunScore, b: RunScore, common: int) -> tuple[str, ...]:

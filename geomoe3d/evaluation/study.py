@@ -14,9 +14,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison, compare
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
-from geomoe3d.evaluation.report_json import to_json
-from geomoe3d.evaluation.report_markdown import to_markdown
-from geomoe3d.evaluation.report_words import run_key
+from geomoe3d.evaluation.report_text import run_key, to_json, to_markdown
 from geomoe3d.evaluation.store import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.evaluation.task import load_run_pairs

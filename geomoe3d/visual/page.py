@@ -27,6 +27,7 @@ from geomoe3d.visual.scene import (
     STATUS_WORDS,
     Scene,
     build_scene,
+    camera_fit,
     choose_rows,
     distance_to_target,
 )
@@ -97,7 +98,11 @@ def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         },
         "lines": _lines(view, scene),
         "motions": {name: None if T is None else T.ravel().tolist() for name, T in motions.items()},
-        "fits": {name: _fit(scene, T) for name, T in motions.items() if T is not None},
+        "fits": {
+            name: camera_fit(scene.target, transform_points(T, scene.source))
+            for name, T in motions.items()
+            if T is not None
+        },
         "distances": distances,
         "distanceLimit": limit,
         "matrices": {name: _matrix_text(T) for name, T in _transforms(view).items()},
@@ -134,16 +139,6 @@ def _lines(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         if mask.any()
     ]
     return {"vertices": base64_floats(ends), "classes": classes}
-
-
-def _fit(scene: Scene, motion: FloatArray) -> dict[str, Any]:
-    """Middle and half size of both clouds under a motion, for the camera."""
-    points = np.concatenate([scene.target, transform_points(motion, scene.source)])
-    if not len(points):
-        return {"center": [0.0, 0.0, 0.0], "radius": 1.0}
-    center = np.percentile(points, [1, 99], axis=0).mean(axis=0)
-    radius = float(np.percentile(np.linalg.norm(points - center, axis=1), 98)) or scene.radius
-    return {"center": center.tolist(), "radius": radius}
 
 
 def _transforms(view: RegistrationView) -> dict[str, FloatArray]:

@@ -8,6 +8,7 @@ in the points, plus a k-d tree of at most 200k target points where distances are
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -118,7 +119,7 @@ def build_scene(view: RegistrationView, *, max_points: int) -> Scene:
         axes=axes,
         up_words=up_words,
         radius=_radius(np.concatenate(shown)),
-        spacing=_spacing(target if len(target) >= len(source) else source),
+        spacing=spacing_of(target if len(target) >= len(source) else source),
     )
 
 
@@ -198,6 +199,24 @@ def nice_length(length: float) -> float:
     return float(max(factor * power for factor in (1.0, 2.0, 5.0) if factor * power <= length * (1 + 1e-9)))
 
 
+def camera_fit(*clouds: FloatArray) -> dict[str, Any]:
+    """Middle (3,) and half size of the bulk of clouds in one frame, for a camera; as plain JSON."""
+    points = np.concatenate([*clouds, np.zeros((0, 3))])
+    center = _center(points)
+    return {"center": center.tolist(), "radius": _radius(points - center)}
+
+
+def spacing_of(points: FloatArray) -> float:
+    """Typical distance of neighbouring points (n, 3), more than 0; 1 for fewer than two."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return 1.0
+    distance = np.asarray(cKDTree(points).query(points[:: max(1, len(points) // 2000)], k=2)[0])[:, 1]
+    positive = distance[distance > 0]
+    return float(np.median(positive)) if len(positive) else 1.0
+
+
 def _center(points: FloatArray) -> FloatArray:
     """(3,) middle of the bulk, so that a few stray points do not move it; zeros for no points."""
     if not len(points):
@@ -209,13 +228,3 @@ def _radius(points: FloatArray) -> float:
     if not len(points):
         return 1.0
     return float(np.percentile(np.linalg.norm(points, axis=1), 98)) or 1.0
-
-
-def _spacing(points: FloatArray) -> float:
-    from scipy.spatial import cKDTree
-
-    if len(points) < 2:
-        return 1.0
-    distance = np.asarray(cKDTree(points).query(points[:: max(1, len(points) // 2000)], k=2)[0])[:, 1]
-    positive = distance[distance > 0]
-    return float(np.median(positive)) if len(positive) else 1.0

@@ -1,0 +1,356 @@
+"""The figures of the HTML report: all runs on one benchmark and track in each, drawn by matplotlib as SVG.
+
+Colours stand for variables of the page's style sheet, so that light and dark mode both work; what belongs to
+a run carries its number as a class, so that the page can switch it off. Cost: some 50 ms per figure.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+from numpy.typing import ArrayLike
+
+from geomoe3d.evaluation.measures import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
+from geomoe3d.evaluation.records import Measure, RunScore
+from geomoe3d.types import FloatArray
+
+NUM_COLORS = 8
+"""Run colours of the style sheet; further runs repeat them with broken lines."""
+NUM_STAGE_COLORS = 16
+MAX_CURVE_POINTS = 200
+_DASHES = ("solid", "dashed", "dotted", "dashdot")
+_SOFT, _LINE, _PAPER = "#abcdf0", "#abcdf1", "#abcdf2"
+_VARIABLES = {_SOFT: "var(--soft)", _LINE: "var(--line)", _PAPER: "var(--paper)"}
+_VARIABLES |= {f"#abcde{k}": f"var(--c{k})" for k in range(NUM_COLORS)}
+"""Colours that are replaced by those of the style sheet."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of the page: its caption, what is drawn, and a sentence below."""
+
+    title: str
+    svg: Markup
+    note: str
+
+
+@dataclass(frozen=True)
+class Series:
+    """One run in one figure.
+
+    Attributes:
+        run: number of the run's label, decides colour and dashes.
+        name: the label.
+        x, y: (n,) points; a NaN breaks the line.
+        intervals: (n, 2) low and high, NaN where there are none; None for no intervals.
+        tips: one text per point, shown on hover; empty for a line without marks.
+        sizes: diameter of each mark in points; empty takes 5.
+        steps: whether y keeps its value up to the next x.
+    """
+
+    run: int
+    name: str
+    x: ArrayLike
+    y: ArrayLike
+    intervals: ArrayLike | None = None
+    tips: Sequence[str] = ()
+    sizes: Sequence[float] = ()
+    steps: bool = False
+
+
+def figures(scores: Sequence[RunScore], runs: Sequence[int]) -> list[Figure]:
+    """Figures of the runs on one benchmark and track; those without anything to show are left out.
+
+    Args:
+        scores: runs of the same benchmark and track.
+        runs: number of each run's label, for its colour.
+    """
+    pairs = list(zip(runs, scores, strict=True))
+    names = dict.fromkeys(name for score in scores for name in score.curves)
+    return [
+        *filter(None, (_recall_figure(name, pairs) for name in names)),
+        *_error_figures(pairs),
+        *_confidence_figures(pairs),
+    ]
+
+
+def draw(
+    title: str,
+    labels: tuple[str, str],
+    series: Sequence[Series],
+    *,
+    x: tuple[float, float],
+    y: tuple[float, float] = (0.0, 100.0),
+    log: bool = False,
+    ticks: dict[float, str] | None = None,
+    limit: tuple[float, str] | None = None,
+    diagonal: bool = False,
+    note: str = "",
+) -> Figure | None:
+    """Lines over two axes; None where there are none.
+
+    Args:
+        title: caption.
+        labels: of the horizontal and the vertical axis.
+        series: drawn in this order.
+        x, y: ends of the axes.
+        log: True for decades on the horizontal axis.
+        ticks: value -> text on the horizontal axis; None for round numbers.
+        limit: a vertical line: x value, text.
+        diagonal: True adds the dotted line from corner to corner.
+        note: one sentence below.
+    """
+    if not series:
+        return None
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure as Canvas
+
+    with rc_context({"svg.fonttype": "none"}):
+        canvas = Canvas(figsize=(4.4, 2.9), layout="constrained")
+        axes = canvas.add_subplot(xlim=x, ylim=y, xscale="log" if log else "linear")
+        axes.set_xlabel(labels[0], color=_SOFT, parse_math=False)
+        axes.set_ylabel(labels[1], color=_SOFT, parse_math=False)
+        if ticks is not None:
+            axes.set_xticks(list(ticks), labels=list(ticks.values()))
+        elif log:
+            axes.xaxis.set_major_formatter("{x:g}")
+        axes.grid(color=_LINE, clip_on=False)
+        axes.tick_params(length=0, which="both", labelcolor=_SOFT)
+        axes.spines[:].set_visible(False)
+        if diagonal:
+            axes.plot(x, y, color=_SOFT, linestyle="dotted", clip_on=False)
+        if limit is not None:
+            axes.axvline(limit[0], color=_SOFT, linestyle="dashed", linewidth=1, clip_on=False)
+            axes.text(limit[0], 0.97 * y[1], f"{limit[1]} ", color=_SOFT, ha="right", va="top")
+        for one in series:
+            _draw_series(axes, one)
+        buffer = io.StringIO()
+        unsaid = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        canvas.savefig(buffer, format="svg", transparent=True, metadata=unsaid)
+    names = ", ".join(one.name for one in series)
+    words = f"{title}: {labels[1]} against {labels[0]}, for {names}"
+    return Figure(title, _for_page(buffer.getvalue(), words), note)
+
+
+def _draw_series(axes: Any, one: Series) -> None:
+    x, y = np.asarray(one.x, dtype=np.float64), np.asarray(one.y, dtype=np.float64)
+    color, dashes = f"#abcde{one.run % NUM_COLORS}", _DASHES[min(one.run // NUM_COLORS, 3)]
+    name = f"run r{one.run}"
+    if one.intervals is not None:
+        low, high = np.asarray(one.intervals, dtype=np.float64).T
+        known = np.isfinite(y) & np.isfinite(low) & np.isfinite(high)
+        bars = axes.vlines(x[known], low[known], high[known], color, linewidth=5, alpha=0.25, clip_on=False)
+        bars.set_gid(name)
+    style = {"drawstyle": "steps-post" if one.steps else "default", "linestyle": dashes}
+    axes.plot(x, y, color=color, gid=name, clip_on=False, **style)
+    for k, tip in enumerate(one.tips):
+        if math.isfinite(x[k]) and math.isfinite(y[k]):
+            size = one.sizes[k] if one.sizes else 5.0
+            mark = {"marker": "o", "markersize": size, "markeredgecolor": _PAPER}
+            axes.plot(x[k], y[k], color=color, gid=f"{name}|{tip}", clip_on=False, **mark)
+
+
+def _for_page(svg: str, words: str) -> Markup:
+    """SVG for the inside of a page: no names of its own, classes for runs, colours of the style sheet.
+
+    A mark that matplotlib draws by the name of its shape gets the shape itself.
+    """
+    found = re.search(r'viewBox="([^"]*)".*?</style>\s*</defs>(.*)', svg, re.DOTALL)
+    assert found is not None
+    box, inside = found.groups()
+    shapes = dict(re.findall(r'<path id="(\w+)" d="([^"]*)"', inside))
+    inside = re.sub(r"<defs>.*?</defs>", "", inside, flags=re.DOTALL)
+    inside = re.sub(
+        r'<use xlink:href="#(\w+)" x="([^"]*)" y="([^"]*)"',
+        lambda m: f'<path d="{shapes[m[1]]}" transform="translate({m[2]} {m[3]})"',
+        inside,
+    )
+    inside = re.sub(
+        r'<g id="(?:(run r\d+)(?:\|([^"]*))?|[^"]*)">',
+        lambda m: (f'<g class="{m[1]}">' if m[1] else "<g>") + (f"<title>{m[2]}</title>" if m[2] else ""),
+        re.sub(r"<g [^>]*/>", "", inside),
+    )
+    inside = re.sub(r"font-family: [^;\"]*;? ?", "", inside)
+    for color, variable in _VARIABLES.items():
+        inside = inside.replace(color, variable)
+    return Markup(f'<svg viewBox="{box}" role="img" aria-label="{escape(words)}">{inside.strip()}')
+
+
+def _recall_figure(name: str, runs: Sequence[tuple[int, RunScore]]) -> Figure | None:
+    """A recall in bins (`RunScore.curves`) of all runs with its 95 % intervals; empty bins break the line.
+
+    Bins are equally wide in the figure, whatever they are in the quantity; empty ones at either end are cut
+    off. Runs whose bins differ from those of the first run are named below instead of drawn.
+    """
+    known = [(run, score.info.label, score.curves[name]) for run, score in runs if name in score.curves]
+    known = [entry for entry in known if any(measure.count for measure in entry[2].measures)]
+    if not known:
+        return None
+    quantity, edges = known[0][2].quantity, known[0][2].edges
+    drawn = [entry for entry in known if entry[2].edges == edges]
+    occupied = [k for k in range(len(edges) - 1) if any(curve.measures[k].count for *_, curve in drawn)]
+    bins = range(occupied[0], occupied[-1] + 1)
+    series = [
+        Series(
+            run,
+            label,
+            [k + 0.5 for k in bins],
+            [curve.measures[k].value for k in bins],
+            [curve.measures[k].interval for k in bins],
+            [
+                f"{label}: {_measure_words(curve.measures[k])}, {quantity} {edges[k]:g} to {edges[k + 1]:g}, "
+                f"{curve.measures[k].count:,} pairs"
+                for k in bins
+            ],
+        )
+        for run, label, curve in drawn
+    ]
+    note = "Bars: 95 % intervals over pairs."
+    others = [label for _, label, curve in known if curve.edges != edges]
+    if others:
+        note += f" Not drawn, because their bins differ: {', '.join(others)}."
+    return draw(
+        f"Recall against {quantity}",
+        (quantity, "% recall, 15 deg and 0.30 m"),
+        series,
+        x=(bins[0], bins[-1] + 1),
+        ticks={float(k): f"{edges[k]:g}" for k in (*bins, bins[-1] + 1)},
+        note=note,
+    )
+
+
+def _error_figures(runs: Sequence[tuple[int, RunScore]]) -> list[Figure]:
+    found = []
+    for what, key, unit, ends, limit in (
+        ("Rotation", "rotation_error_deg", "deg", (0.1, 180.0), (ROTATION_LIMIT_DEG, "15°")),
+        ("Translation", "translation_error", "m", (0.01, 10.0), (TRANSLATION_LIMIT, "0.3 m")),
+    ):
+        series = []
+        for run, score in runs:
+            values = np.array([getattr(p, key) for p in score.pairs], dtype=np.float64)
+            if not np.isnan(values).all():
+                series.append(Series(run, score.info.label, *share_below(values, *ends), steps=True))
+        figure = draw(
+            f"{what} error",
+            (f"{what.lower()} error below, {unit}", "% of pairs"),
+            series,
+            x=ends,
+            log=True,
+            limit=limit,
+            note="Cumulative, over all predicted pairs; pairs without an answer never count as below.",
+        )
+        found += [figure] if figure else []
+    return found
+
+
+def share_below(values: FloatArray, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+    """Points (x, %) of the share of values (n,) up to x, for x from low to high; NaN is not counted."""
+    ordered = np.sort(values[~np.isnan(values)])
+    inside = ordered[(ordered > low) & (ordered <= high)]
+    keep = np.unique(np.linspace(0, len(inside) - 1, min(len(inside), MAX_CURVE_POINTS)).astype(int))
+    x = np.concatenate([[low], inside[keep], [high]])
+    return x, 100.0 * np.searchsorted(ordered, x, side="right") / len(ordered)
+
+
+def _confidence_figures(runs: Sequence[tuple[int, RunScore]]) -> list[Figure]:
+    """Reliability, risk against coverage, and what is believed of unrelated scans."""
+    reliable, risky, believed = [], [], []
+    for run, score in runs:
+        label, calibration = score.info.label, score.calibration
+        if is_unrelated(score):
+            known = np.sort([p.confidence for p in score.pairs if p.confidence is not None])
+            at = np.linspace(0.0, 1.0, 101)
+            above = 100.0 * (known.size - np.searchsorted(known, at, side="right")) / len(score.pairs)
+            believed += [Series(run, label, at, above)] if known.size else []
+        elif calibration is not None:
+            bins = [b for b in calibration.bins if b.count and math.isfinite(b.success)]
+            most = max((b.count for b in bins), default=1)
+            tips = [
+                f"{label}: {100 * b.success:.1f} % right at mean confidence {b.confidence:.2f} "
+                f"({b.low:.2f} to {b.high:.2f}), {b.count} pairs"
+                for b in bins
+            ]
+            x, y = [b.confidence for b in bins], [100.0 * b.success for b in bins]
+            sizes = [3.0 + 8.0 * math.sqrt(b.count / most) for b in bins]
+            reliable += [Series(run, label, x, y, tips=tips, sizes=sizes)] if bins else []
+            curve = 100.0 * np.reshape(calibration.risk_coverage, (-1, 2))
+            keep = np.unique(np.linspace(0, len(curve) - 1, MAX_CURVE_POINTS).astype(int))
+            risky += [Series(run, label, *curve[keep].T)] if len(curve) else []
+    top = max([1.0, *(float(np.max(one.y)) for one in risky)])
+    found = (
+        draw(
+            "Reliability",
+            ("stated confidence", "% right"),
+            reliable,
+            x=(0.0, 1.0),
+            diagonal=True,
+            note="On the dotted line the confidence is what it says. Larger marks hold more pairs.",
+        ),
+        draw(
+            "Risk and coverage",
+            ("% of pairs kept, most confident first", "% wrong among them"),
+            risky,
+            x=(0.0, 100.0),
+            y=(0.0, top),
+            note="Lower is better; a useful confidence keeps the left part near zero.",
+        ),
+        draw(
+            "Confidence in unrelated scans",
+            ("confidence above", "% of pairs"),
+            believed,
+            x=(0.0, 1.0),
+            note="These scans have nothing in common: every confident answer is wrong, lower is better.",
+        ),
+    )
+    return [figure for figure in found if figure is not None]
+
+
+@dataclass(frozen=True)
+class TimeBar:
+    """Times of one run: mean seconds by stage, what is left of the mean, and the median."""
+
+    run: int
+    name: str
+    stages: dict[str, float]
+    rest: float
+    mean: float
+    median: float
+
+
+def time_bars(scores: Sequence[RunScore], runs: Sequence[int]) -> list[TimeBar]:
+    """Mean time per pair by stage, because means add up; runs whose times are not known are left out."""
+    bars = []
+    for run, score in zip(runs, scores, strict=True):
+        seconds = [pair.seconds for pair in score.pairs if math.isfinite(pair.seconds)]
+        if not seconds:
+            continue
+        mean = float(np.mean(seconds))
+        stages: dict[str, float] = {}
+        for pair in score.pairs:
+            for name, value in pair.stages.items():
+                if name != "total" and math.isfinite(value):
+                    stages[name] = stages.get(name, 0.0) + value / len(seconds)
+        whole = sum(stages.values())
+        if whole > mean:  # stages measured inside the method may overlap or be rounded up
+            stages = {name: value * mean / whole for name, value in stages.items()}
+        rest = max(0.0, mean - whole)
+        bars.append(TimeBar(run, score.info.label, stages, rest, mean, float(np.median(seconds))))
+    return bars
+
+
+def is_unrelated(score: RunScore) -> bool:
+    """Whether the pairs of a run have no true motion; False for a run without pairs."""
+    return bool(score.pairs) and all(pair.rotation_error_deg is None for pair in score.pairs)
+
+
+def _measure_words(measure: Measure) -> str:
+    low, high = measure.interval
+    between = f" ({low:.1f} to {high:.1f})" if math.isfinite(low) and math.isfinite(high) else ""
+    return f"{measure.value:.1f}{between} {measure.unit}".strip()

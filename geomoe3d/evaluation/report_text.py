@@ -1,0 +1,445 @@
+"""Scores as text: the words and rounding of all reports, then tables for the terminal, Markdown and JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from geomoe3d.data.threedmatch import BENCHMARKS
+from geomoe3d.evaluation.benchmarks import UNRELATED
+from geomoe3d.evaluation.compare import Comparison
+from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
+from geomoe3d.evaluation.summary import title
+
+COLUMNS = {
+    "recall_15": "recall\n15/0.30",
+    "recall_20": "recall\n20/0.30",
+    "recall_15_scene_mean": "scene\nmean",
+    "rmse_recall": "RMSE\nrecall",
+    "rotation_median": "rotation\ndeg",
+    "translation_median": "transl.\ncm",
+    "verified_f1": "F1 by\nmotion",
+    "accepted": "called\nok",
+    "accepted_right": "right\nof ok",
+    "time_median": "median\nms",
+}
+"""Measures of the main table and their headings."""
+LEGEND = (
+    "recall: % of pairs below 15 (20) deg and 0.30 m, mean over pairs with its 95 % interval; scene mean: "
+    "mean over scenes of the former; RMSE recall: at most 0.20 m, pairs not consecutive; rotation, "
+    "translation: medians over right pairs; F1: inliers by the motion, mean over pairs, %; called ok: % of "
+    "pairs; right of ok: % of those; -: not defined."
+)
+_LONGEST_ERROR = 300
+
+
+def main_row(run: RunScore) -> list[str]:
+    """The cells of the main table without the name of the run; ``-`` where a measure is not defined."""
+    return [value_text(run.measures.get(name)) for name in COLUMNS]
+
+
+def warnings(run: RunScore) -> list[str]:
+    """What a reader must know before the numbers: missing pairs, errors, the truth taken raw."""
+    found = []
+    if run.num_missing:
+        found.append(
+            f"'{run.info.label}' has not answered {run.num_missing:,} of {run.num_pairs:,} pairs; its "
+            f"numbers are over the other {run.num_pairs - run.num_missing:,} and not those of the benchmark"
+        )
+    errors = [score.error for score in run.pairs if score.error is not None]
+    if errors:
+        first = " ".join(errors[0].split())
+        found.append(
+            f"'{run.info.label}' ended with an error on {len(errors):,} of {len(run.pairs):,} pairs; they "
+            f"count as not right; the first: {first[:_LONGEST_ERROR]}{'...' * (len(first) > _LONGEST_ERROR)}"
+        )
+    if run.raw_truth:
+        found.append(
+            f"'{run.info.label}' is scored against the truth as published, whose rotations are not all "
+            "orthonormal: its rotation errors have a floor of up to 1.4 deg"
+        )
+    return found
+
+
+def groups_of(scores: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]:
+    """Runs by benchmark and track: published benchmarks first, unrelated scans last, tracks as they come."""
+    groups: dict[tuple[str, str], list[RunScore]] = {}
+    for run in sorted(scores, key=lambda run: benchmark_rank(run.info.benchmark)):
+        groups.setdefault((run.info.benchmark, run.info.track), []).append(run)
+    return groups
+
+
+def benchmark_rank(name: str) -> int:
+    """Place of a benchmark in a report: 3DMatch, 3DLoMatch, folders, unrelated scans."""
+    return BENCHMARKS.index(name) if name in BENCHMARKS else len(BENCHMARKS) + (name == UNRELATED)
+
+
+def thinning(info: RunInfo) -> int:
+    """n where a run was made on every n-th pair of its benchmark, else 1."""
+    given = info.identity.get("pairs")
+    every = given.get("every") if isinstance(given, dict) else None
+    return every if isinstance(every, int) else 1
+
+
+def pairs_text(run: RunScore) -> str:
+    """How many pairs the run is over, and whether these are a share of the benchmark only."""
+    text = f"{len(run.pairs):,} of {run.num_pairs:,} pairs" if run.num_missing else f"{run.num_pairs:,} pairs"
+    every = thinning(run.info)
+    return text + (f", 1 in {every} of the benchmark" if every > 1 else "")
+
+
+def provenance(run: RunScore) -> list[tuple[str, str]]:
+    """What a run came from, as names and values."""
+    info = run.info
+    return [
+        ("benchmark", f"{info.benchmark}, track {info.track}, {pairs_text(run)}"),
+        ("commit", info.commit or "unknown"),
+        ("hardware", f"{info.hardware}; workers {info.workers}, threads of each {info.threads}"),
+        ("seed", str(info.seed)),
+        ("created", info.created),
+        ("command", info.command),
+    ]
+
+
+def shared_provenance(runs: Sequence[RunScore]) -> list[tuple[str, str]]:
+    """What several runs came from; what they have in common once, else with the names of the runs."""
+    rows = {run_key(run.info): dict(provenance(run)) for run in runs}
+    found: list[tuple[str, str]] = []
+    for name in ("commit", "hardware", "seed", "created", "command"):
+        values: dict[str, list[str]] = {}
+        for run, row in rows.items():
+            values.setdefault(row[name], []).append(run)
+        if name == "created" and len(values) > 1:
+            found.append((name, f"{min(values)} to {max(values)}"))
+            continue
+        for value, named in values.items():
+            found.append((name, value if len(values) == 1 else f"{value} ({', '.join(named)})"))
+    return found
+
+
+def run_key(info: RunInfo) -> str:
+    """What tells a run from every other of a report: label, track, benchmark, and the share of its pairs."""
+    every = thinning(info)
+    return f"{info.label}.{info.track}.{info.benchmark}" + (f".every{every}" if every > 1 else "")
+
+
+def number_text(value: float, digits: int) -> str:
+    """A number with so many digits; ``-`` for NaN."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.{digits}f}" if math.isfinite(value) else "inf"
+
+
+def value_text(measure: Measure | None) -> str:
+    """The value of a measure, rounded as its unit asks; ``-`` where there is none."""
+    return "-" if measure is None else number_text(measure.value, _digits(measure))
+
+
+def interval_text(measure: Measure | None, *, over_scenes: bool = False, gap: str = ", ") -> str:
+    """``[low, high]``, empty where it is not defined."""
+    if measure is None:
+        return ""
+    ends = measure.scene_interval if over_scenes else measure.interval
+    if any(math.isnan(end) for end in ends):
+        return ""
+    return f"[{gap.join(number_text(end, _digits(measure)) for end in ends)}]"
+
+
+def value_and_interval(measure: Measure | None) -> str:
+    """The value with its interval over pairs, as far as there are any."""
+    return f"{value_text(measure)} {interval_text(measure)}".rstrip()
+
+
+def recall_of(run: RunScore) -> float:
+    """Recall over pairs in %, to sort by; -1 where there is none."""
+    measure = run.measures.get("recall_15")
+    return -1.0 if measure is None or math.isnan(measure.value) else measure.value
+
+
+def with_intervals(measure: Measure, *, signed: bool = False) -> str:
+    """Value, interval over pairs, interval over scenes, as far as they are defined."""
+    value = f"{measure.value:+.{_digits(measure)}f}" if signed else value_text(measure)
+    return " ".join(
+        part for part in (value, interval_text(measure), interval_text(measure, over_scenes=True)) if part
+    )
+
+
+def comparison_rows(found: Comparison, names: tuple[str, str]) -> list[tuple[str, str]]:
+    """What two runs come to against each other, as names and values; unrelated scans have times alone."""
+    a, b = names
+    rows = [("pairs answered by both", f"{found.num_pairs:,}")]
+    if found.recall_difference is not None and found.mcnemar_p is not None:
+        rows += [
+            ("both right", f"{found.num_both_right:,}"),
+            (f"only {a} right", f"{len(found.a_only_right):,}"),
+            (f"only {b} right", f"{len(found.b_only_right):,}"),
+            ("neither right", f"{found.num_neither_right:,}"),
+            ("exact McNemar p", f"{found.mcnemar_p:.3g}"),
+            (f"recall of {a} minus {b}, points", with_intervals(found.recall_difference, signed=True)),
+        ]
+    return [
+        *rows,
+        (f"median time of {a} over that of {b}", with_intervals(found.time_ratio)),
+        (f"median of time of {a} over time of {b}", with_intervals(found.pair_time_ratio)),
+    ]
+
+
+def finite(value: Any) -> Any:
+    """Plain JSON: tuples as lists, numpy's numbers as Python's, what is not finite as None."""
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    if isinstance(value, (bool, int, str)) or value is None:
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    plain: Callable[[], Any] | None = getattr(value, "tolist", None)
+    return finite(plain()) if plain is not None else str(value)
+
+
+def _digits(measure: Measure) -> int:
+    return {"%": 1, "points": 2, "deg": 2, "cm": 2, "ms": 1, "MiB": 0}.get(measure.unit, 3)
+
+
+# ---- the terminal ---------------------------------------------------------------------------------
+
+NATURAL_WIDTH = 118
+_SPLIT_WIDTH = 110
+
+
+def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, color: bool = False) -> str:
+    """One table per benchmark and track, one row per run, and below what every run came from.
+
+    Args:
+        scores: runs, in the order of the rows.
+        width: columns; None takes 118, which hold the whole table; below 110 it comes in two parts.
+        color: True for terminal colours.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(width=width or NATURAL_WIDTH, color_system="standard" if color else None)
+    with console.capture() as captured:
+        for (benchmark, track), runs in groups_of(scores).items():
+            sizes = {pairs_text(run) for run in runs}
+            size = f", {sizes.pop()}" if len(sizes) == 1 else ""
+            console.print(Text(f"{benchmark}, track {track}{size}", style="bold"))
+            for columns in _columns(console.width):
+                table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+                table.add_column("run", overflow="fold")
+                for heading in list(COLUMNS.values())[columns]:
+                    table.add_column(Text(heading), justify="right", no_wrap=True)
+                for run in runs:
+                    recall = interval_text(run.measures.get("recall_15"), gap=" ")
+                    cells = [f"{main_row(run)[0]}\n{recall}".rstrip(), *main_row(run)[1:]]
+                    first = Text(run.info.label if size else f"{run.info.label}\n{pairs_text(run)}")
+                    table.add_row(first, *(Text(cell) for cell in cells[columns]))
+                console.print(table)
+            for run in runs:
+                for warning in warnings(run):
+                    console.print(Text(f"WARNING: {warning}", style="bold red"))
+            console.print()
+        console.print(Text(LEGEND))
+        console.print()
+        for name, value in shared_provenance(scores):
+            console.print(Text(f"{name}: {value}"), soft_wrap=True)
+    return captured.get().rstrip("\n")
+
+
+def terminal_comparison(a: RunScore, b: RunScore, found: Comparison) -> str:
+    """Two runs against each other, and below what they came from.
+
+    Args:
+        a: the first run.
+        b: the second run.
+        found: what `compare` says of them.
+    """
+    names = found.a.label, found.b.label
+    if names[0] == names[1]:  # one method at two commits, say
+        names = f"first {names[0]}", f"second {names[1]}"
+    rows = comparison_rows(found, names)
+    width = max(len(name) for name, _ in rows)
+    lines = [
+        f"{names[0]} against {names[1]} on {found.a.benchmark}, track {found.a.track}",
+        "(values with their 95 % intervals over pairs and over scenes)",
+        *(f"  {name:{width}}  {value}" for name, value in rows),
+        *(f"NOTE: {note}" for note in found.notes),
+    ]
+    for who, ids in zip(names, (found.a_only_right, found.b_only_right), strict=True):
+        lines += ["", f"only {who} right:", *(f"  {name}" for name in ids)] if ids else []
+    return "\n".join([*lines, "", *(f"{name}: {value}" for name, value in shared_provenance([a, b]))])
+
+
+def _columns(width: int) -> list[slice]:
+    return [slice(None)] if width >= _SPLIT_WIDTH else [slice(0, 6), slice(6, None)]
+
+
+# ---- Markdown -------------------------------------------------------------------------------------
+
+
+def to_markdown(scores: Sequence[RunScore], comparisons: Sequence[Comparison] = ()) -> str:
+    """Everything as Markdown: the main tables, comparisons, then every run with all its measures."""
+    lines = ["# Evaluation", ""]
+    for (benchmark, track), runs in groups_of(scores).items():
+        lines += [f"## {benchmark}, track {track}", "", *_warning_lines(runs)]
+        lines += _main_lines({f"{_plain(run.info.label)} ({pairs_text(run)})": run for run in runs})
+    lines += [LEGEND[0].upper() + LEGEND[1:], ""]
+    for comparison in comparisons:
+        lines += _comparison_lines(comparison)
+    for run in scores:
+        lines += _run_lines(run)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def benchmark_tables(scores: Sequence[RunScore]) -> str:
+    """The tables of docs/benchmark.md: one per benchmark and track, best recall first; the calibration."""
+    lines: list[str] = []
+    for (benchmark, track), runs in groups_of(scores).items():
+        ranked = sorted(runs, key=recall_of, reverse=True)
+        lines += [f"### {benchmark}, track {track}: {pairs_text(ranked[0])}", "", *_warning_lines(ranked)]
+        if all(run.measures.get("recall_15") is None for run in ranked):
+            rows = [
+                [_plain(run.info.label), value_and_interval(run.measures.get("accepted"))] for run in ranked
+            ]
+            lines += _table(["run", "called ok, %"], rows)
+        else:
+            lines += _main_lines({_plain(run.info.label): run for run in ranked})
+    lines += [LEGEND[0].upper() + LEGEND[1:], ""]
+    rows = [
+        [
+            _plain(run.info.label),
+            f"{run.info.benchmark}, {run.info.track}",
+            *map(value_and_interval, (found.auroc, found.calibration_error, found.accepted)),
+        ]
+        for run, found in ((run, run.calibration) for run in scores)
+        if found is not None
+    ]
+    if rows:
+        lines += ["### Confidence", ""]
+        lines += _table(["run", "benchmark", "AUROC of success", "calibration error", "called ok, %"], rows)
+    said = (
+        [f"Commit {run.info.commit or 'unknown'}" for run in scores],
+        [run.info.hardware for run in scores],
+        [f"{run.info.workers} worker(s) of {run.info.threads} thread(s)" for run in scores],
+        [f"seed {run.info.seed}" for run in scores],
+    )
+    return "\n".join([*lines, "; ".join("; ".join(dict.fromkeys(values)) for values in said) + ".", ""])
+
+
+def _warning_lines(runs: Sequence[RunScore]) -> list[str]:
+    return [f"**Warning: {_plain(warning)}**\n" for run in runs for warning in warnings(run)]
+
+
+def _main_lines(runs: Mapping[str, RunScore]) -> list[str]:
+    """The main table; the first number has its interval beside it."""
+    rows = [
+        [name, value_and_interval(run.measures.get("recall_15")), *main_row(run)[1:]]
+        for name, run in runs.items()
+    ]
+    return _table(["run", *(heading.replace("\n", " ") for heading in COLUMNS.values())], rows)
+
+
+def _comparison_lines(found: Comparison) -> list[str]:
+    a, b = _plain(found.a.label), _plain(found.b.label)
+    lines = [
+        f"## {a} against {b} on {found.a.benchmark}, track {found.a.track}",
+        "",
+        f"{found.num_pairs:,} pairs answered by both; {found.num_only_in_a:,} by {a} only, "
+        f"{found.num_only_in_b:,} by {b} only.",
+        "",
+        *(f"- {_plain(note)}\n" for note in found.notes),
+        *_table(["", "value [95 % over pairs] [over scenes]"], comparison_rows(found, (a, b))),
+    ]
+    for who, ids in ((a, found.a_only_right), (b, found.b_only_right)):
+        if ids:
+            lines += [f"Only {who} right: {', '.join(map(_plain, ids))}", ""]
+    return lines
+
+
+def _run_lines(run: RunScore) -> list[str]:
+    lines = [f"## Run {_plain(run.info.label)} ({_plain(run.info.method)})", "", *_warning_lines([run])]
+    for name, value in provenance(run):
+        lines.append(f"- {name}: {_code(value) if name == 'command' else _plain(value)}")
+    lines += ["", f"identity: {_code(json.dumps(finite(run.info.identity), sort_keys=True))}", ""]
+    head = ["measure", "key", "value", "unit", "95 % over pairs", "over scenes", "pairs"]
+    rows = [
+        [
+            _plain(title(name)),
+            f"`{name}`",
+            value_text(found),
+            found.unit,
+            interval_text(found) or "-",
+            interval_text(found, over_scenes=True) or "-",
+            f"{found.count:,}",
+        ]
+        for name, found in run.measures.items()
+    ]
+    lines += _table(head, rows)
+    names = list(dict.fromkeys(name for measures in run.scenes.values() for name in measures))
+    rows = [
+        [
+            _plain(scene),
+            f"{max((found.count for found in measures.values()), default=0):,}",
+            *(value_and_interval(measures.get(name)) for name in names),
+        ]
+        for scene, measures in run.scenes.items()
+    ]
+    lines += _table(["scene", "pairs", *(f"`{name}`" for name in names)], rows)
+    for curve in run.curves.values():
+        rows = [
+            [f"{low:g} to {high:g}", f"{found.count:,}", value_and_interval(found)]
+            for low, high, found in zip(curve.edges[:-1], curve.edges[1:], curve.measures, strict=True)
+        ]
+        lines += _table([curve.quantity, "pairs", "recall 15/0.30, % [95 % over pairs]"], rows)
+    if run.calibration is not None:
+        error, auroc = map(with_intervals, (run.calibration.calibration_error, run.calibration.auroc))
+        lines += [f"Confidence: expected calibration error {error}, AUROC {auroc}.", ""]
+        rows = [
+            [
+                f"{b.low:.1f} to {b.high:.1f}",
+                f"{b.count:,}",
+                number_text(b.confidence, 3),
+                number_text(b.success, 3),
+            ]
+            for b in run.calibration.bins
+        ]
+        lines += _table(["confidence", "pairs", "mean confidence", "share right"], rows)
+    return lines
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    rule = ["---", *("---:" for _ in head[1:])]
+    return [*("| " + " | ".join(row) + " |" for row in (head, rule, *rows)), ""] if rows else []
+
+
+def _plain(text: str) -> str:
+    """Text that Markdown shows as it is, also inside a table."""
+    return " ".join(re.sub(r"[\\`*_\[\]<>|]", r"\\\g<0>", text).split())
+
+
+def _code(text: str) -> str:
+    """Code in Markdown, whatever backticks it holds."""
+    text = " ".join(text.split())
+    longest = max(map(len, re.findall("`+", text)), default=0)
+    return f"{'`' * (longest + 1)} {text} {'`' * (longest + 1)}" if longest else f"`{text}`"
+
+
+# ---- JSON -----------------------------------------------------------------------------------------
+
+FORMAT = "geomoe3d evaluation 1"
+
+
+def to_json(scores: Sequence[RunScore], comparisons: Sequence[Comparison] = ()) -> str:
+    """Everything as strict JSON with keys as in the records; numbers that are not finite become null."""
+    document = {
+        "format": FORMAT,
+        "runs": [finite(asdict(run)) for run in scores],
+        "comparisons": [finite(asdict(comparison)) for comparison in comparisons],
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -15,7 +15,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.predict import MethodSpec, predict
 from geomoe3d.evaluation.report_text import benchmark_tables
@@ -63,7 +63,7 @@ def main() -> None:
             continue
         for task in part.tasks:
             print(f"{task.benchmark}, track {task.track}: {', '.join(part.methods)}", file=sys.stderr)
-            with stdout_to_stderr(), progress_bar("predictions", quiet=False) as advance:
+            with stdout_to_stderr(), progress_bar("predictions") as advance:
                 report = predict(
                     given.out,
                     [MethodSpec(name) for name in part.methods],

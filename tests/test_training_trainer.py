@@ -107,9 +107,9 @@ def test_going_on_with_other_settings_or_data_is_refused(tmp_path: Path) -> None
 def test_one_skipped_step_spoils_neither_the_log_nor_the_display(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from geomoe3d.cli import train_display
+    from geomoe3d.cli import progress, train_display
 
-    monkeypatch.setattr(train_display, "_PLAIN_EVERY_S", 0.0)
+    monkeypatch.setattr(progress, "_LOG_SECONDS", 0.0)
     step = Updater.step
     calls = []
 
@@ -122,8 +122,8 @@ def test_one_skipped_step_spoils_neither_the_log_nor_the_display(
     monkeypatch.setattr(Updater, "step", failing)
     with train_display.Display() as display:
         TrainingRun(config_of(), tmp_path).train(display)
-    (shown,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("step 6/6")]
-    assert "nan" not in shown
+    (shown,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("6 of 6 steps")]
+    assert "nan" not in shown and "loss" in shown
     rows = read_csv(tmp_path / "train.csv")
     assert [int(row["skipped"]) for row in rows] == [1, 2, 2]
     assert all(np.isfinite(float(row["loss"])) for row in rows)

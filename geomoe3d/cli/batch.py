@@ -64,8 +64,7 @@ def command(
     what is missing. A file that cannot be read fails its own pairs alone. Exit code 0 where every pair is
     ok, 3 where some are not, 2 for unusable input.
     """
-    from geomoe3d.cli.progress import count_display
-    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.config import load_config
 
     named = {"voxel_size": voxel_size, "seed": seed}
@@ -73,7 +72,7 @@ def command(
     config = load_config(config_file, [*assignments, *given])
     from geomoe3d.batch.run import ALL_THAT_FIT, register_pairs
 
-    with stdout_to_stderr(), count_display("pairs", quiet) as progress:
+    with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:
         report = register_pairs(
             pairs,
             out,

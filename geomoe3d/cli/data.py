@@ -39,7 +39,7 @@ def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None
 
     Exit code 0 when every listed pair can be used, else 2.
     """
-    from geomoe3d.cli.terminal import progress_bar
+    from geomoe3d.cli.progress import progress_bar
     from geomoe3d.data.check import check_folder
 
     with progress_bar("fragments", quiet=as_json) as advance:
@@ -108,12 +108,12 @@ def fragments(
     FRAMES holds frame-*.depth.png with *.pose.txt (7-Scenes, 3DMatch), depth.txt with groundtruth.txt (TUM),
     or depth/*.png with poses.txt. Poses are camera to world. Unusable frames are named and skipped.
     """
-    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.data.fragments import make_fragments
     from geomoe3d.data.fusion import THREEDMATCH_VOLUME, FusionSettings
     from geomoe3d.data.rgbd import open_recording
 
-    with stdout_to_stderr(), progress_bar("fragments", quiet=False) as advance:
+    with stdout_to_stderr(), progress_bar("fragments") as advance:
         recording = open_recording(
             frames,
             convention=convention,
@@ -188,7 +188,7 @@ def synthesize(
     """
     from pathlib import Path
 
-    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.config import build_config, read_yaml, set_keys
     from geomoe3d.data.contact import draw_contact_sheet
     from geomoe3d.data.report import report_text, write_report
@@ -203,7 +203,7 @@ def synthesize(
 
         click.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), nl=False)
         return
-    with stdout_to_stderr(), progress_bar("scenes", quiet=False) as advance:
+    with stdout_to_stderr(), progress_bar("scenes") as advance:
         report = make(
             out,
             scenes,
@@ -258,10 +258,10 @@ def features(
     ROOT is any folder that 'geomoe3d data check' knows. Started again, it goes on; a shard that no longer
     fits its fragments or settings is refused. Train with data.train=OUT. Exit code 2 when OUT got no shard.
     """
-    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.data.describe import describe_collection
 
-    with stdout_to_stderr(), progress_bar("scenes", quiet=False) as advance:
+    with stdout_to_stderr(), progress_bar("scenes") as advance:
         report = describe_collection(
             root,
             out,
@@ -300,10 +300,10 @@ def motions(context: click.Context, features: str, out: str, pairs: int, seed: i
     FEATURES is what 'geomoe3d data features' made. A network that judges motions trains on OUT
     (configs/train/motions.yaml, data.train=OUT). Started again, it goes on. Exit code 2 when a shard fails.
     """
-    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.training.motions import propose_motions
 
-    with stdout_to_stderr(), progress_bar("shards", quiet=False) as advance:
+    with stdout_to_stderr(), progress_bar("shards") as advance:
         report = propose_motions(features, out, pairs, seed=seed, workers=workers, progress=advance)
     for line in report.failed:
         click.echo(f"failed: {line}", err=True)

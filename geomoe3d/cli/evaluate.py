@@ -184,7 +184,7 @@ def _predict(
     seed: int,
     fresh: bool,
 ) -> None:
-    from geomoe3d.cli.terminal import progress_bar, stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.predict import MethodSpec, predict
     from geomoe3d.evaluation.task import Task
@@ -199,7 +199,7 @@ def _predict(
         task.pairs()  # a wrong name is told at once, not when the first benchmark is done
     made = absent = 0
     for task in tasks:
-        with stdout_to_stderr(), progress_bar("predictions", quiet=False) as advance:
+        with stdout_to_stderr(), progress_bar("predictions") as advance:
             report = predict(
                 study, specs, task, workers=workers, fresh=fresh, command=command_line(), progress=advance
             )
@@ -212,7 +212,7 @@ def _predict(
 
 
 def _score(study: Path, *, raw: bool) -> list[StudiedRun]:
-    from geomoe3d.cli.terminal import progress_bar
+    from geomoe3d.cli.progress import progress_bar
     from geomoe3d.evaluation.study import score_study
 
     with progress_bar("runs", quiet=not sys.stderr.isatty()) as advance:

@@ -82,8 +82,7 @@ def command(
     the reason. Called again with more scans, all pairs of earlier calls are reused. Exit code 0 where all
     scans stand in one group, 3 where not, 2 for unusable input.
     """
-    from geomoe3d.cli.progress import count_display
-    from geomoe3d.cli.terminal import stdout_to_stderr
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.config import load_config
 
     if len(inputs) < 2:
@@ -96,7 +95,7 @@ def command(
     from geomoe3d.batch.run import ALL_THAT_FIT
     from geomoe3d.multiway.run import register_scans
 
-    with stdout_to_stderr(), count_display("pairs", quiet) as progress:
+    with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:
         model = register_scans(
             inputs[:-1],
             inputs[-1],

@@ -95,7 +95,7 @@ def command(
 
         check_display()
 
-    from geomoe3d.cli.terminal import stage_display, stdout_to_stderr
+    from geomoe3d.cli.progress import stage_display, stdout_to_stderr
 
     with stdout_to_stderr(), stage_display(quiet) as stage:
         stage("start")  # importing the libraries below takes a second

@@ -18,7 +18,7 @@ def command(folder: str, seed: int, force: bool) -> None:
     Two views of one generated room, as a depth camera sees it, go into FOLDER (default: sample) as
     source.ply and target.ply, with the true motion in T_target_source.txt. Metres.
     """
-    from geomoe3d.cli.terminal import stage_display, stdout_to_stderr
+    from geomoe3d.cli.progress import stage_display, stdout_to_stderr
     from geomoe3d.data.sample import write_sample_pair
 
     with stdout_to_stderr(), stage_display(quiet=False) as stage:

@@ -119,6 +119,7 @@ def test_a_transform_reads_back_bit_for_bit_from_every_format(tmp_path, finished
     for suffix in (".txt", ".npy", ".json"):
         assert load_transform(tmp_path / f"t{suffix}").tobytes() == result.T_target_source.tobytes()
     (tmp_path / "short.txt").write_text("1 2\n3 4\n")
+    (tmp_path / "t.xml").write_text("<T/>")
     for name, kind in (("none.txt", InputError), ("short.txt", FormatError), ("t.xml", FormatError)):
         with pytest.raises(kind):
             load_transform(tmp_path / name)

@@ -250,7 +250,8 @@ def test_a_first_guess_of_a_file_is_handed_on(tmp_path, scan_files, fake_registr
 
 def test_a_first_guess_that_is_not_there_is_named(tmp_path, scan_files, fake_registrar, capsys):
     assert call("register", *scan_files, "--initial", str(tmp_path / "T.txt")) == 2
-    assert "T.txt not found" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "T.txt" in message and "No such file" in message
 
 
 def test_weights_for_a_filter_that_takes_none_are_refused(scan_files, fake_registrar, capsys):

@@ -26,9 +26,9 @@ PAGE_MARK = '<meta name="generator" content="geomoe3d batch">'
 _KIND = "geomoe3d batch "
 _HEAD_BYTES = 4096  # marks stand in the first lines
 _LONGEST_NAME = 255  # bytes, of nearly every file system
-_TRANSFORM_HEAD = re.compile(
-    r"# maps SOURCE \(.*\) into TARGET \(.*\): p_target = R p_source \+ t\r?\n"
-    r"# status \w+, confidence [\d.]+\r?\n(?:# pair (.*?)\r?\n)?[^#]"
+_TRANSFORM_HEAD = re.compile(  # the rows stand behind the remarks in batches of old
+    r"(?:[^#\n]*\n){0,4}# maps SOURCE \(.*\) into TARGET \(.*\): p_target = R p_source \+ t\r?\n"
+    r"# status \w+, confidence [\d.]+\r?\n(?:# pair (.*?)\r?\n)?(?:[^#]|$)"
 )
 
 

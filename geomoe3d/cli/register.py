@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 class _Outputs:
     """What is to be written, each None where it was not asked for."""
 
-    transform: str | None
+    transforms: tuple[str, ...]
     aligned: str | None
+    precision: str
     picture: str | None
     page: str | None
 
@@ -37,11 +38,23 @@ class _Outputs:
 @click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [auto]")
 @click.option("--weights", metavar="FILE", help="Trained weights of the filter geomoe (.safetensors).")
 @click.option("--estimator", metavar="NAME", help="consensus, ransac or svd. [consensus]")
-@click.option("--initial", metavar="FILE", help="A first guess (.txt, .npy, .json), verified, not trusted.")
+@click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
 @click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
-@click.option("--output", metavar="FILE", help="Write the transform: .txt, .npy, or .json (whole result).")
+@click.option(
+    "--output",
+    metavar="[FORMAT:]FILE",
+    multiple=True,
+    help="Write the transform; repeatable. By suffix: .txt (rows, as CloudCompare takes them), .npy, .json "
+    "(whole result), .yaml (tf), .tum, .kitti; by name: pdal:FILE, ros:FILE, quaternion:FILE, ...",
+)
 @click.option("--aligned", metavar="FILE", help="Write SOURCE at full resolution, moved into TARGET.")
+@click.option(
+    "--aligned-precision",
+    metavar="WHICH",
+    default="auto",
+    help="Coordinates of PLY and PCD: auto, double, or single (floats about an origin). [auto]",
+)
 @click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
 @click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
@@ -63,8 +76,9 @@ def command(
     initial: str | None,
     inverse: bool,
     as_json: bool,
-    output: str | None,
+    output: tuple[str, ...],
     aligned: str | None,
+    aligned_precision: str,
     picture: str | None,
     page: str | None,
     show: bool,
@@ -88,7 +102,7 @@ def command(
     }
     given = [f"{key}={value}" for key, value in named.items() if value is not None]
     config = load_config(config_file, [*assignments, *given])
-    outputs = _Outputs(output, aligned, picture, page)
+    outputs = _Outputs(output, aligned, aligned_precision, picture, page)
     _check_outputs(outputs, (source, target), force)
     if show:
         from geomoe3d.visual.window import check_display
@@ -140,15 +154,15 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
 
 def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> None:
     """Every output path is refused before the work begins, if it has to be refused at all."""
-    from geomoe3d.clouds.io import WRITABLE_MESH_SUFFIXES, WRITABLE_SUFFIXES
-    from geomoe3d.clouds.transform_files import TRANSFORM_SUFFIXES, check_suffix
+    from geomoe3d.clouds.io import check_aligned
+    from geomoe3d.clouds.transform_files import check_suffix, transform_format
     from geomoe3d.errors import OutputError
     from geomoe3d.runtime.files import check_output
     from geomoe3d.visual.picture import FORMATS
 
     wanted = (
-        ("--output", outputs.transform, TRANSFORM_SUFFIXES),
-        ("--aligned", outputs.aligned, tuple(dict.fromkeys((*WRITABLE_SUFFIXES, *WRITABLE_MESH_SUFFIXES)))),
+        *(("--output", str(transform_format(path)[1]), ()) for path in outputs.transforms),
+        ("--aligned", outputs.aligned, ()),
         ("--picture", outputs.picture, FORMATS),
         ("--page", outputs.page, (".html", ".htm")),
     )
@@ -156,11 +170,15 @@ def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> N
     for option, path, suffixes in wanted:
         if path is None:
             continue
-        check_suffix(path, suffixes)
+        if suffixes:
+            check_suffix(path, suffixes)
         check_output(path, force=force)
-        owner = taken.setdefault(Path(path).resolve(), option)
-        if owner != option:
+        owner = taken.get(Path(path).resolve())
+        if owner is not None:
             raise OutputError(f"{option} '{path}' is also {owner}; give another name")
+        taken[Path(path).resolve()] = option
+    if outputs.aligned is not None:
+        check_aligned(outputs.aligned, inputs[0], precision=outputs.precision, force=force)
 
 
 def _write(
@@ -179,20 +197,28 @@ def _write(
 
     skipped: list[str] = []
     lost: tuple[str, ...] = ()
-    if outputs.transform is not None:
-        answer = result.inverse() if inverse else result
-        comments = [
-            direction(answer, inverse),
-            f"status {result.status}, confidence {result.confidence:.4f}, geomoe3d {__version__}",
-        ]
-        if not save_result(outputs.transform, answer, comments, force=force):
-            skipped.append(outputs.transform)
+    answer = result.inverse() if inverse else result
+    comments = [
+        direction(answer, inverse),
+        f"status {result.status}, confidence {result.confidence:.4f}, geomoe3d {__version__}",
+    ]
+    frames = ("source", "target") if inverse else ("target", "source")
+    for path in outputs.transforms:
+        if not save_result(path, answer, comments, frames=frames, force=force):
+            skipped.append(path)
     if outputs.aligned is not None:
         stage("write the aligned cloud")
         if has_transform(result):
             from geomoe3d.clouds.io import save_aligned
 
-            lost = save_aligned(outputs.aligned, source, result.T_target_source, force=force)
+            lost = save_aligned(
+                outputs.aligned,
+                source,
+                result.T_target_source,
+                precision=outputs.precision,
+                force=force,
+                remark=lambda sentence: click.echo(f"note: {sentence}", err=True),
+            )
         else:
             skipped.append(outputs.aligned)
     if explanation is not None and (outputs.picture is not None or outputs.page is not None):

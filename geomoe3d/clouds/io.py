@@ -9,6 +9,7 @@ from geomoe3d.clouds.loading import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.saving import (
     WRITABLE_MESH_SUFFIXES,
     WRITABLE_SUFFIXES,
+    check_aligned,
     check_cloud_output,
     save_aligned,
     save_points,
@@ -18,6 +19,7 @@ __all__ = [
     "READABLE_SUFFIXES",
     "WRITABLE_MESH_SUFFIXES",
     "WRITABLE_SUFFIXES",
+    "check_aligned",
     "check_cloud_output",
     "load_points",
     "save_aligned",

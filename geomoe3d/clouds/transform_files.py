@@ -1,47 +1,93 @@
-"""A rigid motion as a file: text with a comment on which way it maps, a NumPy array, or the result as JSON.
+"""A rigid motion as a file, for geomoe3d and for other programs.
 
-Stands beside `files`, below everything that registers. Numbers keep every bit: 17 significant digits in
-text, float64 in NPY, shortest exact form in JSON.
+Stands beside `files`, below everything that registers. Numbers keep every bit: 17 significant digits in text
+(a quaternion rounds the rotation once more), float64 in NPY, shortest exact form in JSON. The texts
+themselves are in `transform_formats`.
 """
 
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.clouds.transform_formats import TEXTS, describe_error, matrix_text, of_matrix, parse_transform
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.types import FloatArray
 
-TRANSFORM_SUFFIXES = (".txt", ".json", ".npy")
+TRANSFORM_FORMATS = (*TEXTS, "json", "npy")
+_BY_SUFFIX = {
+    **{".txt": "matrix", ".mat": "matrix", ".json": "json", ".npy": "npy", ".yaml": "tf", ".yml": "tf"},
+    **{".tum": "tum", ".kitti": "kitti"},
+}
+TRANSFORM_SUFFIXES = tuple(_BY_SUFFIX)
+_LARGEST_TEXT = 1 << 24  # bytes; a transform is some hundred
+
+transform_text = matrix_text
 
 
-def transform_text(T: FloatArray, comments: list[str]) -> str:
-    """Four rows of 17 significant digits under ``#`` comments; `numpy.loadtxt` reads it back bit for bit."""
-    head = "".join(f"# {' '.join(line.split())}\n" for line in comments)
-    return head + "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in T)
+def transform_format(target: str | os.PathLike[str]) -> tuple[str, Path]:
+    """The format that a path stands for, and the path: ``pdal:T.json``, ``T.kitti.txt`` or ``T.tum``.
+
+    A name in front of a colon decides, else the inner one of two suffixes, else the last.
+
+    Raises:
+        FormatError: no format of that name or suffix.
+    """
+    text = os.fspath(target)
+    name, colon, rest = text.partition(":")
+    if colon and re.fullmatch(r"[A-Za-z]{2,}", name):
+        if name.lower() not in TRANSFORM_FORMATS or not rest:
+            raise FormatError(
+                f"cannot write '{text}': no format '{name}'; use one of {', '.join(TRANSFORM_FORMATS)} (or "
+                f"'./{text}', if that is the file's name)"
+            )
+        return name.lower(), Path(rest)
+    path = Path(text)
+    inner = Path(path.stem).suffix[1:].lower()
+    if inner in TRANSFORM_FORMATS and path.suffix:
+        return inner, path
+    suffix = check_suffix(
+        path, TRANSFORM_SUFFIXES, "; or name a format, such as pdal:FILE: " + ", ".join(TEXTS)
+    )
+    return _BY_SUFFIX[suffix], path
 
 
 def save_transform(
-    path: str | os.PathLike[str], T: FloatArray, comments: list[str], *, force: bool = False
+    path: str | os.PathLike[str],
+    T: FloatArray,
+    comments: Sequence[str],
+    *,
+    frames: tuple[str, str] = ("target", "source"),
+    force: bool = False,
 ) -> None:
-    """Write a motion (4, 4) as .txt (with the comments) or .npy.
+    """Write a motion (4, 4) in any format of `transform_format` but a whole result.
+
+    Args:
+        path: the file, with or without the name of a format.
+        T: p_target = R p_source + t.
+        comments: lines that say which way it maps, where the format has room for them.
+        frames: what T maps into, and what it maps, in formats that name frames.
+        force: replace an existing file.
 
     Raises:
         InputError: the matrix is not (4, 4) or not finite.
-        FormatError: the suffix is neither of the two.
+        FormatError: no such format, or "json", which is a whole result's.
         OutputError: as `geomoe3d.runtime.files.write_atomically`.
     """
-    path = Path(path)
+    kind, path = transform_format(path)
     T = np.asarray(T, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(f"'{path}' not written: expected a finite (4, 4) matrix, found {T.tolist()}")
-    suffix = check_suffix(path, (".txt", ".npy"))
-    if suffix == ".txt":
-        write_text(path, transform_text(T, comments), force=force)
+    if kind == "json":
+        raise FormatError(f"cannot write '{path}': JSON holds whole results; use .txt or .npy for a matrix")
+    if kind in TEXTS:
+        write_text(path, TEXTS[kind](T, comments, frames), force=force)
         return
 
     def write(temporary: Path) -> None:
@@ -52,24 +98,29 @@ def save_transform(
 
 
 def save_result(
-    path: str | os.PathLike[str], result: RegistrationResult, comments: list[str], *, force: bool = False
+    path: str | os.PathLike[str],
+    result: RegistrationResult,
+    comments: Sequence[str],
+    *,
+    frames: tuple[str, str] = ("target", "source"),
+    force: bool = False,
 ) -> bool:
-    """Write a result as its suffix says: .json the whole result, .txt or .npy its transform.
+    """Write a result: as JSON the whole, in any other format its transform.
 
     Returns:
-        False where nothing was written because the result holds no transform and the suffix asks for one.
+        False where nothing was written because the result holds no transform and the format asks for one.
 
     Raises:
-        FormatError: an unknown suffix.
+        FormatError: no such format.
         OutputError: as `geomoe3d.runtime.files.write_atomically`.
     """
-    path = Path(path)
-    if check_suffix(path, TRANSFORM_SUFFIXES) == ".json":
-        write_text(path, result.to_json() + "\n", force=force)
+    kind, file = transform_format(path)
+    if kind == "json":
+        write_text(file, result.to_json() + "\n", force=force)
         return True
     if not has_transform(result):
         return False
-    save_transform(path, result.T_target_source, comments, force=force)
+    save_transform(path, result.T_target_source, comments, frames=frames, force=force)
     return True
 
 
@@ -78,7 +129,7 @@ def has_transform(result: RegistrationResult) -> bool:
     return bool(np.isfinite(result.T_target_source).all())
 
 
-def check_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> str:
+def check_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...], more: str = "") -> str:
     """The lower-case suffix of a path.
 
     Raises:
@@ -87,34 +138,34 @@ def check_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> str
     suffix = Path(path).suffix.lower()
     if suffix not in suffixes:
         found = f"suffix '{suffix}'" if suffix else "no suffix"
-        raise FormatError(f"cannot write '{path}': {found}; use one of {', '.join(suffixes)}")
+        raise FormatError(f"cannot write '{path}': {found}; use one of {', '.join(suffixes)}{more}")
     return suffix
 
 
 def load_transform(path: str | os.PathLike[str]) -> FloatArray:
-    """The motion (4, 4) of a file that `save_transform` or `save_result` wrote, or of four rows of text.
+    """The motion (4, 4) of a file, told from its content whatever its name.
+
+    Anything that `save_result` writes; also a matrix of four or three rows of text, ROS 1's
+    static_transform_publisher, geometry_msgs as YAML, and a PDAL pipeline with one filters.transformation.
 
     Raises:
         InputError: the file cannot be read, or holds a result without a transform.
-        FormatError: an unknown suffix, or not 4 x 4 numbers.
+        FormatError: nothing that is understood as one motion.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in TRANSFORM_SUFFIXES:
-        raise FormatError(
-            f"'{path}' has no suffix of a transform; use one of {', '.join(TRANSFORM_SUFFIXES)}"
-        )
     try:
-        if suffix == ".json":
-            T = RegistrationResult.from_json(path.read_text(encoding="utf-8")).T_target_source
-        elif suffix == ".npy":
-            T = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        with path.open("rb") as handle:
+            data = handle.read(_LARGEST_TEXT)
+        if data[:6] == b"\x93NUMPY":
+            T = of_matrix(np.asarray(np.load(path, allow_pickle=False), dtype=np.float64))
+        elif b"\0" in data or len(data) == _LARGEST_TEXT:
+            raise FormatError("it is no text")
         else:
-            T = np.loadtxt(path, dtype=np.float64, ndmin=2)
+            T = parse_transform(data.decode("utf-8-sig", errors="replace"))
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
-    except (ValueError, EOFError) as error:
-        raise FormatError(f"'{path}' holds no transform: {error}") from None
+    except (ValueError, EOFError, KeyError, TypeError, RecursionError) as error:
+        raise FormatError(f"'{path}' holds no transform: {describe_error(error)}") from None
     if T.shape != (4, 4):
         raise FormatError(f"'{path}' holds numbers of shape {T.shape}, expected (4, 4)")
     if not np.isfinite(T).all():

@@ -13,6 +13,8 @@ from pydantic import Field, model_validator
 
 from geomoe3d.config import Section
 
+Frame = Literal["given", "principal", "hypothesis", "principal_hypothesis"]
+
 ExtraChannel = Literal["compatibility", "hypothesis", "feature_distance", "ratio", "mutual", "aligned"]
 
 Kind = Literal["geomoe", "pointcn", "oanet", "umatch", "dematch", "demo", "pointdsc"]
@@ -40,7 +42,7 @@ _USED: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Of each baseline, the keys that mean something to it, beside those that mean something to all."""
 
-_USED_BY_ALL = ("kind", "num_layers", "width", "unit_voxels")
+_USED_BY_ALL = ("kind", "num_layers", "width", "unit_voxels", "frame")
 
 CHANNEL_WIDTHS: dict[str, int] = {
     "compatibility": 4,
@@ -71,6 +73,9 @@ class NetworkConfig(Section):
         "difference", description="input [p, q-p], [p, q], or extra channels alone (blind to rigid motion)"
     )
     unit_voxels: float = Field(20.0, gt=0, description="voxels in one unit of the network's coordinates")
+    frame: Frame = Field(
+        "given", description="coordinates as given, or turned into a frame that follows from the pair"
+    )
     embedding_norm: bool = Field(True, description="ContextNorm right after the embedding")
     extra_channels: tuple[ExtraChannel, ...] = Field((), description="channels beside the coordinates")
     knn_space: Literal["correspondence", "motion", "source", "compatibility"] = Field(
@@ -144,6 +149,8 @@ class NetworkConfig(Section):
             raise ValueError("the channels 'aligned' stand alone: no other extra channel, motion_form none")
         if self.judges_motions and (self.knn_space != "source" or self.correspondence_dim != 6):
             raise ValueError("the channels 'aligned' need knn_space source and correspondence_dim 6")
+        if self.frame != "given" and (self.motion_form == "none" or self.correspondence_dim != 6):
+            raise ValueError(f"frame {self.frame} turns coordinates of 3D points; this network sees none")
         if self.compatibility_anchors > self.compatibility_full:
             raise ValueError(
                 f"compatibility_anchors {self.compatibility_anchors} exceeds compatibility_full "

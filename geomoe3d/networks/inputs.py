@@ -20,6 +20,7 @@ from geomoe3d.errors import InputError, NonFiniteError
 from geomoe3d.networks.aligned import AlignedChannels
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.compatibility import compatibility_inputs
+from geomoe3d.networks.frames import canonical_rotations
 from geomoe3d.networks.geomoe import find_neighbors
 
 MIN_CORRESPONDENCES = 3
@@ -33,11 +34,13 @@ class PairInput:
         coordinates: (N, 2d) float32, centred, in network units.
         channels: (N, C) float32 extra channels, or None.
         neighbors: (N, K) int64, the row itself first.
+        turned: rotations (3, 3) that source and target were turned by, or None where they were not.
     """
 
     coordinates: Tensor
     channels: Tensor | None
     neighbors: Tensor
+    turned: tuple[Tensor, Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,11 @@ def pair_input(
             the network was trained with and that is not given.
         NonFiniteError: a coordinate is NaN or infinite.
     """
-    voxels = _check(correspondences, voxel_size, config)[1]
+    points, voxels = _check(correspondences, voxel_size, config)
+    turned = None
+    if config.frame != "given":
+        A, B = turned = canonical_rotations(points, voxel_size, config.frame)
+        voxels = torch.cat([voxels[:, :3] @ A.T.float(), voxels[:, 3:] @ B.T.float()], dim=1)
     coordinates = voxels / config.unit_voxels
     if config.judges_motions:
         raise InputError("this network judges motions; prepare it with MotionInputs, which is given some")
@@ -113,7 +120,7 @@ def pair_input(
         neighbors = compatibility.neighbors
     else:
         neighbors = find_neighbors(coordinates[None], config)[0]
-    return PairInput(coordinates, torch.cat(channels, dim=1) if channels else None, neighbors)
+    return PairInput(coordinates, torch.cat(channels, dim=1) if channels else None, neighbors, turned)
 
 
 class MotionInputs:

@@ -141,6 +141,9 @@ def make_sample(
         ratio=pair.ratio,
         mutual=pair.mutual,
     )
+    if inputs.turned is not None:
+        A, B = (turn.float() for turn in inputs.turned)
+        truth[:3] = torch.cat([B @ truth[:3, :3] @ A.T, B @ truth[:3, 3:]], dim=1)
     return Sample((inputs,), labels, truth)
 
 

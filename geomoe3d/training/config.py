@@ -6,7 +6,8 @@ run is the same run in small.
 
 from __future__ import annotations
 
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -116,8 +117,25 @@ class TrainConfig(Section):
 def load_train_config(path: str | None = None, assignments: list[str] | None = None) -> TrainConfig:
     """The run of a YAML file (None: defaults) with ``key=value`` changes.
 
+    A file that says ``base: OTHER.yaml``, beside it, gives only what differs from that one.
+
     Raises:
         ConfigError: unreadable file, unknown key (names the nearest), value out of range.
     """
-    tree = read_yaml(path) if path is not None else {}
+    tree = _read_with_base(Path(path)) if path is not None else {}
     return build_config(TrainConfig, set_keys(tree, assignments or []), str(path or "training configuration"))
+
+
+def _read_with_base(path: Path) -> dict[str, Any]:
+    tree = read_yaml(path)
+    base = tree.pop("base", None)
+    return tree if base is None else _merged(_read_with_base(path.parent / str(base)), tree)
+
+
+def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """``changes`` laid over ``base``, section by section."""
+    result = dict(base)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = _merged(result[key], value) if both else value
+    return result

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_networks import sample
+from tiny_networks import SMALL, sample, settle, small
 from training_runs import config_of
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError
 from geomoe3d.networks.architecture import NetworkConfig
-from geomoe3d.networks.build import Network, build_network
+from geomoe3d.networks.build import build_network
 from geomoe3d.networks.counting import count_cost, num_parameters
 from geomoe3d.networks.pretrained import WeightCard, load_network, save_pretrained
 from geomoe3d.training.losses import similarity_loss
@@ -29,28 +29,7 @@ PUBLISHED = {
     "demo": (4_519_908, 3.612e9),
     "pointdsc": (1_053_667, 2.101e9),
 }
-SMALL: dict[str, dict[str, object]] = {
-    "pointcn": {"num_layers": 3, "width": 16},
-    "oanet": {"width": 16, "num_sub_fields": 6},
-    "umatch": {"num_layers": 2, "width": 16, "num_heads": 2},
-    "dematch": {"num_layers": 2, "width": 32, "num_heads": 2, "num_sub_fields": 6},
-    "demo": {"num_layers": 1, "width": 16, "num_heads": 2, "num_sub_fields": 6},
-    "pointdsc": {"num_layers": 2, "width": 16},
-}
 each_kind = pytest.mark.parametrize("kind", SMALL)
-
-
-def small(kind: str) -> Network:
-    torch.manual_seed(0)
-    return build_network(build_config(NetworkConfig, {"kind": kind, **SMALL[kind]}))
-
-
-def settled(kind: str) -> Network:
-    """With statistics of its own in the batch norms, so that evaluation is no trivial case."""
-    model = small(kind).train()
-    for seed in range(3):
-        model(sample(4, 60, seed))
-    return model.eval()
 
 
 @pytest.mark.parametrize("kind", PUBLISHED)
@@ -63,7 +42,7 @@ def test_size_and_cost_are_the_published_ones(kind: str) -> None:
 
 @each_kind
 def test_order_of_the_correspondences_does_not_matter(kind: str) -> None:
-    model = settled(kind)
+    model = settle(small(kind))
     x = sample(1, 80, 5)
     order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -73,7 +52,7 @@ def test_order_of_the_correspondences_does_not_matter(kind: str) -> None:
 
 @each_kind
 def test_padded_batch_equals_single_pairs(kind: str) -> None:
-    model = settled(kind)
+    model = settle(small(kind))
     lengths = [3, 5, 40, 64]
     pairs = [sample(1, n, n) for n in lengths]
     batch = torch.full((4, 64, 6), 1e3)
@@ -127,7 +106,7 @@ def test_one_batch_is_learnt_by_heart(
 
 @each_kind
 def test_weights_on_disk_are_the_network(kind: str, tmp_path: Path) -> None:
-    model = settled(kind)
+    model = settle(small(kind))
     save_pretrained(tmp_path / "w.safetensors", model, WeightCard(architecture={}))
     again, card = load_network(tmp_path / "w.safetensors")
     assert card.architecture["kind"] == kind

@@ -1,4 +1,4 @@
-"""Canonical frames: clouds turned before a network that sees coordinates, so that it matters less how they lay.
+"""Canonical frames: clouds turned before a network sees them, so that it matters less how they lay.
 
 Such a network profits from frames as scanners give them, where neighbouring scans differ by little. It loses
 that where clouds are turned at random. A frame that follows from the correspondences gives some of it back.
@@ -41,7 +41,7 @@ def canonical_rotations(points: Tensor, voxel_size: float, frame: Frame) -> tupl
 def principal_axes(points: Tensor) -> Tensor:
     """(3, 3) rotation whose rows are the axes of points (N, 3), largest spread first."""
     centred = points - points.mean(0)
-    axes = torch.linalg.eigh(centred.T @ centred)[1].flip(1).T
+    axes: Tensor = torch.linalg.eigh(centred.T @ centred)[1].flip(1).T
     skew = (centred @ axes.T).pow(3).sum(0)
     axes = axes * torch.where(skew < 0, -1.0, 1.0).to(axes.dtype)[:, None]
     if torch.linalg.det(axes) < 0:

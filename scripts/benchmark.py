@@ -17,10 +17,10 @@ from pathlib import Path
 
 from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
 from geomoe3d.evaluation.benchmarks import UNRELATED
+from geomoe3d.evaluation.evaluation_set import EvaluationSet
 from geomoe3d.evaluation.predict import MethodSpec, predict
 from geomoe3d.evaluation.report_text import benchmark_tables
-from geomoe3d.evaluation.study import score_study, write_report
-from geomoe3d.evaluation.task import Task
+from geomoe3d.evaluation.score import score_runs, write_report
 from geomoe3d.runtime.files import write_text
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
@@ -34,16 +34,28 @@ class Part:
 
     name: str
     methods: tuple[str, ...]
-    tasks: tuple[Task, ...]
+    sets: tuple[EvaluationSet, ...]
 
 
 PARTS = (
-    Part("1k", ESTIMATORS, (Task("3DMatch", "1k"), Task("3DLoMatch", "1k"))),
+    Part("1k", ESTIMATORS, (EvaluationSet("3DMatch", "1k"), EvaluationSet("3DLoMatch", "1k"))),
     # A million samples take seconds where inliers are rare, so that search sees fewer pairs.
-    Part("1m", ("open3d-ransac-1m",), (Task("3DMatch", "1k", every=8), Task("3DLoMatch", "1k", every=8))),
-    Part("all", ("consensus",), (Task("3DMatch", "all", every=8), Task("3DLoMatch", "all", every=8))),
-    Part("clouds", SYSTEMS, (Task("3DMatch", "clouds", every=4), Task("3DLoMatch", "clouds", every=4))),
-    Part(UNRELATED, ("geomoe3d",), (Task(UNRELATED, "clouds"),)),
+    Part(
+        "1m",
+        ("open3d-ransac-1m",),
+        (EvaluationSet("3DMatch", "1k", every=8), EvaluationSet("3DLoMatch", "1k", every=8)),
+    ),
+    Part(
+        "all",
+        ("consensus",),
+        (EvaluationSet("3DMatch", "all", every=8), EvaluationSet("3DLoMatch", "all", every=8)),
+    ),
+    Part(
+        "clouds",
+        SYSTEMS,
+        (EvaluationSet("3DMatch", "clouds", every=4), EvaluationSet("3DLoMatch", "clouds", every=4)),
+    ),
+    Part(UNRELATED, ("geomoe3d",), (EvaluationSet(UNRELATED, "clouds"),)),
 )
 
 
@@ -61,13 +73,13 @@ def main() -> None:
     for part in PARTS:
         if given.only and part.name not in given.only:
             continue
-        for task in part.tasks:
-            print(f"{task.benchmark}, track {task.track}: {', '.join(part.methods)}", file=sys.stderr)
+        for chosen in part.sets:
+            print(f"{chosen.benchmark}, track {chosen.track}: {', '.join(part.methods)}", file=sys.stderr)
             with stdout_to_stderr(), progress_bar("predictions") as advance:
                 report = predict(
                     given.out,
                     [MethodSpec(name) for name in part.methods],
-                    task,
+                    chosen,
                     workers=given.workers,
                     fresh=given.fresh,
                     command=command,
@@ -75,7 +87,7 @@ def main() -> None:
                 )
             for name, reason in report.absent.items():
                 print(f"absent: {name}: {reason}", file=sys.stderr)
-    runs = score_study(given.out)
+    runs = score_runs(given.out)
     write_report(Path(given.out) / "report.html", runs, force=True)
     write_report(Path(given.out) / "report.json", runs, force=True)
     put_tables(Path(given.docs), benchmark_tables([run.score for run in runs]))

@@ -26,7 +26,7 @@ from geomoe3d.config import load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
 from geomoe3d.decision.confidence import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, Information, confidence_inputs
 from geomoe3d.evaluation.calibration import calibration_error_of
-from geomoe3d.evaluation.measures import is_right, motion_errors
+from geomoe3d.evaluation.metrics import is_right, motion_errors
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
 from geomoe3d.scoring.surfaces import Evidence

@@ -15,7 +15,7 @@ import numpy as np
 
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.calibration import auroc_of, calibration_error_of
-from geomoe3d.evaluation.study import score_study
+from geomoe3d.evaluation.score import score_runs
 
 
 def main() -> None:
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("out")
     parser.add_argument("--run", default="geomoe3d")
     given = parser.parse_args()
-    runs = [r.score for r in score_study(given.out) if r.score.info.label == given.run]
+    runs = [r.score for r in score_runs(given.out) if r.score.info.label == given.run]
     runs = [run for run in runs if run.info.track == "clouds"]
     pairs = [p for run in runs if run.info.benchmark != UNRELATED for p in run.pairs]
     confidence = np.array([p.confidence or 0.0 for p in pairs])

@@ -22,7 +22,7 @@ from geomoe3d.estimators.base import Estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
 from geomoe3d.estimators.surroundings import Surroundings
-from geomoe3d.evaluation.measures import is_right, motion_errors
+from geomoe3d.evaluation.metrics import is_right, motion_errors
 from geomoe3d.evaluation.records import INLIER_THRESHOLD
 from geomoe3d.types import Correspondences
 

@@ -24,7 +24,7 @@ from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.threedmatch import find_benchmark_root, read_gt_log, true_motion
-from geomoe3d.evaluation.memory import PeakMemory
+from geomoe3d.evaluation.peak_memory import PeakMemory
 from geomoe3d.geometry.rigid_fit import fit_rigid
 from geomoe3d.geometry.se3 import (
     inverse,

@@ -61,7 +61,7 @@ from geomoe3d.data.threedmatch import (
 )
 from geomoe3d.estimators.base import make_estimator
 from geomoe3d.estimators.proposals import solve
-from geomoe3d.evaluation.measures import motion_errors
+from geomoe3d.evaluation.metrics import motion_errors
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
 from geomoe3d.filters.base import make_filter
 from geomoe3d.geometry.se3 import inverse, residuals

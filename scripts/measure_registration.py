@@ -25,7 +25,7 @@ from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import BENCHMARKS, BenchmarkPair, load_benchmark
 from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, UNRELATED
-from geomoe3d.evaluation.measures import is_right, motion_errors
+from geomoe3d.evaluation.metrics import is_right, motion_errors
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, translation_error
 from geomoe3d.registration import Registrar
 from geomoe3d.types import FloatArray

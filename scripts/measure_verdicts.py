@@ -20,7 +20,7 @@ from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.evaluation.calibration import auroc_of
-from geomoe3d.evaluation.measures import is_right, motion_errors, precision_recall_f1
+from geomoe3d.evaluation.metrics import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
 from geomoe3d.filters.motion_judge import MotionJudge
 from geomoe3d.geometry.se3 import residuals

@@ -10,9 +10,9 @@ import pytest
 from geomoe3d.data.threedmatch import find_benchmark_root
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.compare import compare
+from geomoe3d.evaluation.evaluation_set import EvaluationSet
 from geomoe3d.evaluation.predict import MethodSpec, predict
-from geomoe3d.evaluation.study import score_study, write_report
-from geomoe3d.evaluation.task import Task
+from geomoe3d.evaluation.score import score_runs, write_report
 
 EVERY = {"3DMatch": 72, "3DLoMatch": 87}
 """Twelve pairs each."""
@@ -27,9 +27,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory):
     study = tmp_path_factory.mktemp("smoke")
     for benchmark, every in EVERY.items():
         specs = [MethodSpec("consensus"), MethodSpec("spectral")]
-        predict(study, specs, Task(benchmark, "1k", every=every))
-        predict(study, [MethodSpec("geomoe3d")], Task(benchmark, "clouds", every=every))
-    return {(run.score.info.label, run.score.info.benchmark): run for run in score_study(study)}
+        predict(study, specs, EvaluationSet(benchmark, "1k", every=every))
+        predict(study, [MethodSpec("geomoe3d")], EvaluationSet(benchmark, "clouds", every=every))
+    return {(run.score.info.label, run.score.info.benchmark): run for run in score_runs(study)}
 
 
 def test_every_run_is_there_with_all_its_pairs(runs) -> None:

@@ -21,11 +21,11 @@ from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
 from geomoe3d.evaluation import predict as module
 from geomoe3d.evaluation.benchmarks import load_pairs
 from geomoe3d.evaluation.compare import compare
+from geomoe3d.evaluation.evaluation_set import EvaluationSet, load_run_pairs
 from geomoe3d.evaluation.predict import MethodSpec, predict, predict_one
+from geomoe3d.evaluation.predictions import encode, find_runs, read_info, read_predictions
 from geomoe3d.evaluation.records import Answer, MethodInput, Prediction
-from geomoe3d.evaluation.store import encode, find_runs, read_info, read_predictions
 from geomoe3d.evaluation.summary import summarise
-from geomoe3d.evaluation.task import Task, load_run_pairs
 from geomoe3d.evaluation.tracks import InputMaker
 from geomoe3d.runtime.journal import Journal
 
@@ -85,8 +85,8 @@ def use(monkeypatch: pytest.MonkeyPatch):
 
 
 def run_one(posed_folder: Path, out: Path, **changes):
-    task = Task(str(posed_folder), changes.pop("track", "clouds"), every=changes.pop("every", 1))
-    return predict(out, [MethodSpec("fake")], task, **changes)
+    chosen = EvaluationSet(str(posed_folder), changes.pop("track", "clouds"), every=changes.pop("every", 1))
+    return predict(out, [MethodSpec("fake")], chosen, **changes)
 
 
 def test_every_pair_once_and_then_never_again(posed_folder: Path, tmp_path: Path, use) -> None:
@@ -137,11 +137,11 @@ def test_other_settings_never_mix(posed_folder: Path, tmp_path: Path, use, ident
     run_one(posed_folder, tmp_path)
     before = (tmp_path / "fake.clouds.posed" / "predictions.jsonl").read_bytes()
     use(fake=Fake(identity=identity))
-    task = Task(str(posed_folder), "clouds", **changes)
+    chosen = EvaluationSet(str(posed_folder), "clouds", **changes)
     with pytest.raises(InputError, match=named):
-        predict(tmp_path, [MethodSpec("fake")], task)
+        predict(tmp_path, [MethodSpec("fake")], chosen)
     assert (tmp_path / "fake.clouds.posed" / "predictions.jsonl").read_bytes() == before
-    report = predict(tmp_path, [MethodSpec("fake")], task, fresh=True)
+    report = predict(tmp_path, [MethodSpec("fake")], chosen, fresh=True)
     assert (report.made, report.kept) == (6, 0)
 
 
@@ -205,8 +205,8 @@ def test_two_methods_see_each_pair_in_turn(posed_folder: Path, tmp_path: Path, u
         return answer
 
     use(a=Fake(noting("a")), b=Fake(noting("b")), gone=Fake(absent="pip install gone"))
-    task = Task(str(posed_folder), "clouds", every=2)
-    report = predict(tmp_path, [MethodSpec("a"), MethodSpec("gone"), MethodSpec("b")], task)
+    chosen = EvaluationSet(str(posed_folder), "clouds", every=2)
+    report = predict(tmp_path, [MethodSpec("a"), MethodSpec("gone"), MethodSpec("b")], chosen)
     assert order == ["a", "a", "b", "b", *["a", "b"] * 2]  # the first time once more, off the clock
     assert report.absent == {"gone": "pip install gone"}
     assert sorted(run.name for run in find_runs(tmp_path)) == [
@@ -228,7 +228,7 @@ def test_two_runs_of_one_name_are_refused(posed_folder: Path, tmp_path: Path, us
     use(fake=Fake(), other=Fake())
     specs = [MethodSpec("fake", label="x"), MethodSpec("other", label="x")]
     with pytest.raises(InputError, match="same name"):
-        predict(tmp_path, specs, Task(str(posed_folder), "clouds"))
+        predict(tmp_path, specs, EvaluationSet(str(posed_folder), "clouds"))
 
 
 def test_damaged_files_are_named(posed_folder: Path, tmp_path: Path, use) -> None:
@@ -287,9 +287,9 @@ def comparable(prediction: Prediction) -> str:
 
 
 def test_two_workers_predict_the_same(posed_folder: Path, tmp_path: Path) -> None:
-    task, specs = Task(str(posed_folder), "1k"), [MethodSpec("consensus"), MethodSpec("spectral")]
+    chosen, specs = EvaluationSet(str(posed_folder), "1k"), [MethodSpec("consensus"), MethodSpec("spectral")]
     for workers in (1, 2):
-        predict(tmp_path / str(workers), specs, task, workers=workers)
+        predict(tmp_path / str(workers), specs, chosen, workers=workers)
     for name in ("consensus.1k.posed", "spectral.1k.posed"):
         one, two = (read_predictions(tmp_path / str(workers) / name) for workers in (1, 2))
         assert sorted(map(comparable, one)) == sorted(map(comparable, two))
@@ -320,7 +320,7 @@ def test_a_method_that_takes_its_process_along_loses_that_pair_alone(
     own.write_text(DEADLY.replace("LIMIT", repr(float(victim[0, 0]))))
     died = [pair.id for pair in pairs if pair.source == pairs[3].source]
     specs = [MethodSpec(f"{own}:{name}", label=name) for name in ("harmless", "deadly")]
-    report = predict(tmp_path, specs, Task(str(posed_folder), "clouds"), workers=2)
+    report = predict(tmp_path, specs, EvaluationSet(str(posed_folder), "clouds"), workers=2)
     assert report.made == 12
     harmless, deadly = (read_predictions(run) for run in report.folders)
     assert [prediction.error for prediction in harmless] == [None] * 6
@@ -337,4 +337,4 @@ def test_a_method_that_takes_its_process_along_loses_that_pair_alone(
 
 
 def test_unrelated_pairs_are_not_thinned() -> None:
-    assert Task("unrelated", "clouds", every=40) == Task("unrelated", "clouds")
+    assert EvaluationSet("unrelated", "clouds", every=40) == EvaluationSet("unrelated", "clouds")

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from geomoe3d.geometry.se3 import make_transform, rotation_angle_deg, transform_points
 from geomoe3d.result import Alternative
+from geomoe3d.visual.drawing import build_drawing, distance_to_target
 from geomoe3d.visual.page import render_page, save_page
-from geomoe3d.visual.scene import build_scene, distance_to_target
 from geomoe3d.visual.view import RegistrationView
 
 # ---------------------------------------------------------------- the page as a file
@@ -90,7 +90,7 @@ def test_page_keeps_user_text_as_text_and_asks_no_network():
 def test_page_data_are_the_clouds_and_the_answer():
     view = nasty_view()
     data = Page(render_page(view)).data()
-    scene = build_scene(view, max_points=50_000)
+    scene = build_drawing(view, max_points=50_000)
     source = decode(data["source"]["points"], "<f4").reshape(-1, 3)
     assert len(source) == len(view.source_points)
     after = np.array(data["motions"]["answer"]).reshape(4, 4)
@@ -202,7 +202,7 @@ def test_page_in_a_browser(tmp_path, webgl):
     )
 
     # The slider moves the source rigidly: spherical interpolation, about the source's own middle.
-    scene = build_scene(view, max_points=50_000)
+    scene = build_drawing(view, max_points=50_000)
     path = Slerp([0, 1], Rotation.from_matrix([scene.before[:3, :3], scene.after[:3, :3]]))
     for at in (0, 0.25, 0.5, 1):
         expected = make_transform(
@@ -246,5 +246,5 @@ def test_page_without_transform_shows_only_before(tmp_path):
     assert "error" not in seen
     assert seen["locked"] == "true"
     assert seen["drawn-points"] == str(len(view.source_points) + len(view.target_points))
-    scene = build_scene(view, max_points=50_000)
+    scene = build_drawing(view, max_points=50_000)
     np.testing.assert_allclose(model(seen), scene.before, atol=1e-9)

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from geomoe3d.errors import FormatError, OutputError
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.result import Alternative, CloudReport
+from geomoe3d.visual.drawing import build_drawing
 from geomoe3d.visual.page import save_page
 from geomoe3d.visual.picture import draw_picture, save_picture
-from geomoe3d.visual.scene import build_scene
 from geomoe3d.visual.view import RegistrationView
 from geomoe3d.visual.xray import xray
 
@@ -213,7 +213,7 @@ def test_real_kitchen(tmp_path):
         make_result(T),
         np.zeros((0, 6)),
     )
-    assert build_scene(view, max_points=5000).up_words == "camera, y down"
+    assert build_drawing(view, max_points=5000).up_words == "camera, y down"
     figure = draw_picture(view)
     before, after = dark_shares(figure)
     assert after > 2.0 * before

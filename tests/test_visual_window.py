@@ -11,7 +11,7 @@ from registration_views import nasty_view, room_view, without_transform
 
 from geomoe3d.errors import OutputError
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.visual.scene import build_scene
+from geomoe3d.visual.drawing import build_drawing
 from geomoe3d.visual.window import WindowContent, show_window
 
 
@@ -31,7 +31,7 @@ def test_window_without_display_says_so(monkeypatch):
 def test_window_content_switches():
     pytest.importorskip("open3d", exc_type=ImportError)
     view = nasty_view()
-    scene = build_scene(view, max_points=1000)
+    scene = build_drawing(view, max_points=1000)
     content = WindowContent(replace(view, groups=None), scene)
 
     def source():
@@ -57,7 +57,7 @@ def test_window_content_switches():
     pairs = np.asarray(content.lines.lines)
     assert len(pairs) and (pairs[:, 0] == pairs[:, 1]).all()
     lost = without_transform(replace(view, groups=None, correspondences=np.zeros((0, 6))))
-    content = WindowContent(lost, build_scene(lost, max_points=1000))
+    content = WindowContent(lost, build_drawing(lost, max_points=1000))
     content.switch_stage()
     content.switch_alternative()
     assert len(content.geometries()) == 2

@@ -23,7 +23,7 @@ from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import STATUS_WORDS, thin
+from geomoe3d.visual.drawing import STATUS_WORDS, thin
 from geomoe3d.visual.templates import render
 from geomoe3d.visual.thumbnail import pair_thumbnail
 from geomoe3d.visual.upright import upright_axes

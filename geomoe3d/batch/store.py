@@ -33,7 +33,7 @@ from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, find_weights
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
-from geomoe3d.runtime.provenance import hardware, source_commit
+from geomoe3d.runtime.provenance import differences, hardware, source_commit
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class BatchStore:
         for path in (folder / JOURNAL_FILE, folder / RESULTS_FILE):
             if path.exists() and (stored is None or not path.is_file()):
                 raise InputError(foreign(path))
-        differing = [] if stored is None or fresh else _differences(stored, self._identity)
+        differing = [] if stored is None or fresh else differences(stored, self._identity)
         if differing:
             raise InputError(
                 f"'{folder}' holds results of another batch; they differ in {'; '.join(differing)}. "
@@ -189,22 +189,3 @@ def _weights_hash(config: RegistrationConfig) -> str | None:
         return None
     path = find_weights(config.filter.weights or DEFAULT_WEIGHTS)
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-
-
-def _differences(stored: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
-    old, new = _flat(stored), _flat(wanted)
-    return [
-        f"{key} ({old.get(key, 'absent')} there, {new.get(key, 'absent')} now)"
-        for key in sorted(old.keys() | new.keys())
-        if old.get(key) != new.get(key)
-    ]
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    rows: dict[str, str] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            rows.update(_flat(value, f"{prefix}{key}."))
-        else:
-            rows[prefix + key] = json.dumps(value)
-    return rows

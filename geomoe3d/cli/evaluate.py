@@ -13,7 +13,7 @@ import click
 from geomoe3d.cli.errors import BAD_INPUT, HELP, command_line, traceback_option
 
 if TYPE_CHECKING:
-    from geomoe3d.evaluation.study import StudiedRun
+    from geomoe3d.evaluation.score import ScoredRun
 
 
 @click.group(context_settings=HELP)
@@ -97,7 +97,7 @@ def predict(**given: Any) -> None:
 @traceback_option
 def run(**given: Any) -> None:
     """Predict, score, and write OUT/report.html, report.md and report.json (replaced each time)."""
-    from geomoe3d.evaluation.study import write_report
+    from geomoe3d.evaluation.score import write_report
 
     _predict(**given)
     study = Path(given["study"])
@@ -124,7 +124,7 @@ def run(**given: Any) -> None:
 def score(study: str, raw: bool, reports: tuple[str, ...], force: bool, quiet: bool) -> None:
     """Score the predictions in OUT: recall, errors, precision and recall of inliers, time, calibration."""
     from geomoe3d.errors import InputError
-    from geomoe3d.evaluation.study import REPORT_SUFFIXES, write_report
+    from geomoe3d.evaluation.score import REPORT_SUFFIXES, write_report
     from geomoe3d.runtime.files import check_output
 
     for report in reports:
@@ -186,22 +186,22 @@ def _predict(
 ) -> None:
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.errors import InputError
+    from geomoe3d.evaluation.evaluation_set import EvaluationSet
     from geomoe3d.evaluation.predict import MethodSpec, predict
-    from geomoe3d.evaluation.task import Task
 
     if label is not None and len(methods) != 1:
         raise InputError(f"--label names one run, but {len(methods)} methods are given; give one method")
     if assignments and "geomoe3d" not in methods:
         raise InputError("--set is for the method geomoe3d, which is not among those given")
     specs = [MethodSpec(name, assignments if name == "geomoe3d" else (), label) for name in methods]
-    tasks = [Task(benchmark, track, root, every, num_unrelated, seed) for benchmark in benchmarks]
-    for task in tasks[1:]:
-        task.pairs()  # a wrong name is told at once, not when the first benchmark is done
+    sets = [EvaluationSet(benchmark, track, root, every, num_unrelated, seed) for benchmark in benchmarks]
+    for one in sets[1:]:
+        one.pairs()  # a wrong name is told at once, not when the first benchmark is done
     made = absent = 0
-    for task in tasks:
+    for one in sets:
         with stdout_to_stderr(), progress_bar("predictions") as advance:
             report = predict(
-                study, specs, task, workers=workers, fresh=fresh, command=command_line(), progress=advance
+                study, specs, one, workers=workers, fresh=fresh, command=command_line(), progress=advance
             )
         for name, reason in report.absent.items():
             click.echo(f"absent: {name}: {reason}", err=True)
@@ -211,15 +211,15 @@ def _predict(
         click.get_current_context().exit(BAD_INPUT if absent else 0)
 
 
-def _score(study: Path, *, raw: bool) -> list[StudiedRun]:
+def _score(study: Path, *, raw: bool) -> list[ScoredRun]:
     from geomoe3d.cli.progress import progress_bar
-    from geomoe3d.evaluation.study import score_study
+    from geomoe3d.evaluation.score import score_runs
 
     with progress_bar("runs", quiet=not sys.stderr.isatty()) as advance:
-        return score_study(study, raw_truth=raw, progress=advance)
+        return score_runs(study, raw_truth=raw, progress=advance)
 
 
-def _print_table(runs: list[StudiedRun]) -> None:
+def _print_table(runs: list[ScoredRun]) -> None:
     import shutil
 
     from geomoe3d.evaluation.report_text import terminal_table

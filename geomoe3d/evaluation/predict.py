@@ -15,14 +15,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.evaluation.memory import PeakMemory
+from geomoe3d.evaluation.evaluation_set import EvaluationSet, fingerprint
 from geomoe3d.evaluation.methods import make_method
+from geomoe3d.evaluation.peak_memory import PeakMemory
+from geomoe3d.evaluation.predictions import encode, open_run, remove_run
 from geomoe3d.evaluation.records import (
     Answer,
     EvaluationPair,
@@ -32,8 +35,6 @@ from geomoe3d.evaluation.records import (
     Prediction,
     RunInfo,
 )
-from geomoe3d.evaluation.store import encode, open_run, remove_run
-from geomoe3d.evaluation.task import Task, fingerprint
 from geomoe3d.evaluation.tracks import InputMaker, needs
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.journal import Journal
@@ -77,19 +78,19 @@ class PredictReport:
 def predict(
     study: str | Path,
     methods: Sequence[MethodSpec],
-    task: Task,
+    chosen: EvaluationSet,
     *,
     workers: int = 1,
     fresh: bool = False,
     command: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> PredictReport:
-    """Predict what is missing of every method's run on one task.
+    """Predict what is missing of every method's run on one evaluation set.
 
     Args:
         study: folder of the runs; made if missing. Each run lies in ``<label>.<track>.<benchmark>``.
         methods: at least one; those that are not installed are reported, not run.
-        task: pairs and input.
+        chosen: pairs and input.
         workers: processes over pairs; times are only comparable between runs of as many.
         fresh: True removes the predictions of these runs first.
         command: for the record.
@@ -102,8 +103,8 @@ def predict(
     """
     if workers < 1:
         raise InputError(f"there must be at least 1 worker, found {workers}")
-    wanted = needs(task.track)
-    pairs = task.pairs()
+    wanted = needs(chosen.track)
+    pairs = chosen.pairs()
     made = {spec: make_method(spec.spec, spec.assignments) for spec in methods}
     absent = {spec.spec: reason for spec, method in made.items() if (reason := method.absent()) is not None}
     present = [spec for spec in made if spec.spec not in absent]
@@ -111,9 +112,9 @@ def predict(
         if wanted not in made[spec].inputs:
             raise InputError(
                 f"method '{spec.spec}' takes {' or '.join(sorted(made[spec].inputs))}, but the track "
-                f"'{task.track}' gives {wanted}; leave it out or choose another track"
+                f"'{chosen.track}' gives {wanted}; leave it out or choose another track"
             )
-    folders = {spec: Path(study) / run_name(spec, task) for spec in present}
+    folders = {spec: Path(study) / run_name(spec, chosen) for spec in present}
     if len(set(folders.values())) < len(folders):
         raise InputError("two runs have the same name; give one of them another label")
     todo: dict[str, list[int]] = {}
@@ -123,18 +124,18 @@ def predict(
         for number, spec in enumerate(present):
             if fresh:
                 remove_run(folders[spec])
-            info = _info(spec, made[spec], task, pairs, workers, command)
+            info = _info(spec, made[spec], chosen, pairs, workers, command)
             journal, done = open_run(folders[spec], info)
             journals.append(stack.enter_context(journal))
             kept += len(done)
             for pair in pairs:
                 if pair.id not in done:
                     todo.setdefault(pair.id, []).append(number)
-        jobs = [_Job(tuple(present), task, pair, tuple(todo[pair.id])) for pair in pairs if pair.id in todo]
+        jobs = [_Job(tuple(present), chosen, pair, tuple(todo[pair.id])) for pair in pairs if pair.id in todo]
         total, count = kept + sum(map(len, todo.values())), kept
         if progress is not None:
             progress(count, total)
-        _Bench.made_for = None  # files of the user's may have changed since the last call
+        _bench.cache_clear()  # files of the user's may have changed since the last call
         pool = SerialPool() if workers == 1 else ProcessPool(workers, threads=_threads(workers))
         for answers in _answers(pool, jobs):
             for number, record in answers:
@@ -145,26 +146,31 @@ def predict(
     return PredictReport(tuple(folders.values()), count - kept, kept, absent)
 
 
-def run_name(spec: MethodSpec, task: Task) -> str:
+def run_name(spec: MethodSpec, chosen: EvaluationSet) -> str:
     """Folder of a run inside its study: label, track, benchmark, and the share of pairs."""
     label = spec.label or spec.spec
-    benchmark = Path(task.benchmark).name or "folder"
-    name = f"{label}.{task.track}.{benchmark}" + (f".every{task.every}" if task.every > 1 else "")
+    benchmark = Path(chosen.benchmark).name or "folder"
+    name = f"{label}.{chosen.track}.{benchmark}" + (f".every{chosen.every}" if chosen.every > 1 else "")
     return "".join(c if c.isalnum() or c in "._-+" else "_" for c in name)
 
 
 def _info(
-    spec: MethodSpec, method: Method, task: Task, pairs: list[EvaluationPair], workers: int, command: str
+    spec: MethodSpec,
+    method: Method,
+    chosen: EvaluationSet,
+    pairs: list[EvaluationPair],
+    workers: int,
+    command: str,
 ) -> RunInfo:
-    maker = InputMaker(task.track, task.benchmark, task.root)
+    maker = InputMaker(chosen.track, chosen.benchmark, chosen.root)
     identity: dict[str, Any] = {
         "method": method.identity(),
         "input": maker.identity(pairs),
         "pairs": {
-            "benchmark": task.benchmark,
-            "root": task.root,
-            "every": task.every,
-            "num_unrelated": task.num_unrelated,
+            "benchmark": chosen.benchmark,
+            "root": chosen.root,
+            "every": chosen.every,
+            "num_unrelated": chosen.num_unrelated,
             "fingerprint": fingerprint(pairs),
         },
         "workers": workers,
@@ -173,12 +179,12 @@ def _info(
     return RunInfo(
         label=spec.label or spec.spec,
         method=spec.spec,
-        track=task.track,
+        track=chosen.track,
         benchmark=pairs[0].benchmark,
         identity=identity,
         commit=source_commit(),
         hardware=hardware(),
-        seed=task.seed,
+        seed=chosen.seed,
         command=command,
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         workers=workers,
@@ -199,7 +205,7 @@ class _Job:
     """One pair and the methods that have not answered it yet, by their place in ``specs``."""
 
     specs: tuple[MethodSpec, ...]
-    task: Task
+    chosen: EvaluationSet
     pair: EvaluationPair
     numbers: tuple[int, ...]
 
@@ -227,41 +233,32 @@ def _no_answer(pair: EvaluationPair, reason: str) -> Prediction:
 
 
 class _Bench:
-    """What a process keeps between pairs."""
+    """What a process keeps between pairs: methods and the maker of their input."""
 
-    made_for: tuple[tuple[MethodSpec, ...], Task] | None = None
-    methods: Sequence[Method] = ()
-    inputs: InputMaker
-    warm: set[int]
+    def __init__(self, specs: tuple[MethodSpec, ...], chosen: EvaluationSet) -> None:
+        self.methods = [make_method(spec.spec, spec.assignments) for spec in specs]
+        self.inputs = InputMaker(chosen.track, chosen.benchmark, chosen.root, seed=chosen.seed)
+        self._warm: set[int] = set()
 
-    @classmethod
-    def set_up(cls, specs: tuple[MethodSpec, ...], task: Task) -> None:
-        """Make the methods and the maker of their input, unless they are there."""
-        if cls.made_for == (specs, task):
-            return
-        cls.made_for = None
-        cls.methods = [make_method(spec.spec, spec.assignments) for spec in specs]
-        cls.inputs = InputMaker(task.track, task.benchmark, task.root, seed=task.seed)
-        cls.warm = set()
-        cls.made_for = specs, task
-
-    @classmethod
-    def warm_up(cls, number: int, given: MethodInput) -> None:
+    def warm_up(self, number: int, given: MethodInput) -> None:
         """Let a method answer once in this process, off the clock: libraries load and threads start."""
-        if number not in cls.warm:
-            cls.warm.add(number)
+        if number not in self._warm:
+            self._warm.add(number)
             with suppress(GeoMoE3DError):
-                cls.methods[number](given)
+                self.methods[number](given)
+
+
+_bench = lru_cache(maxsize=1)(_Bench)
 
 
 def _predict_pair(job: _Job) -> _Answers:
     """The named methods on one pair, as records."""
-    _Bench.set_up(job.specs, job.task)
-    given = _Bench.inputs(job.pair)
+    bench = _bench(job.specs, job.chosen)
+    given = bench.inputs(job.pair)
     found = []
     for number in job.numbers:
-        _Bench.warm_up(number, given)
-        found.append((number, encode(predict_one(_Bench.methods[number], job.pair, given))))
+        bench.warm_up(number, given)
+        found.append((number, encode(predict_one(bench.methods[number], job.pair, given))))
     return found
 
 

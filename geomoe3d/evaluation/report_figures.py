@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike
 
-from geomoe3d.evaluation.measures import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
+from geomoe3d.evaluation.metrics import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
 from geomoe3d.evaluation.records import Measure, RunScore
 from geomoe3d.types import FloatArray
 

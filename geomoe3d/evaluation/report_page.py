@@ -24,7 +24,7 @@ from geomoe3d.data.collection import load_fragment
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.evaluation import report_text
 from geomoe3d.evaluation.compare import Comparison
-from geomoe3d.evaluation.measures import has_motion
+from geomoe3d.evaluation.metrics import has_motion
 from geomoe3d.evaluation.records import EvaluationPair, PairScore, Prediction, RunScore
 from geomoe3d.evaluation.report_figures import NUM_COLORS, NUM_STAGE_COLORS, figures, is_unrelated, time_bars
 from geomoe3d.evaluation.report_text import benchmark_rank, recall_of, run_key, warnings
@@ -32,7 +32,7 @@ from geomoe3d.evaluation.summary import title
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.runtime.files import check_output, write_text
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import camera_fit, spacing_of, thin
+from geomoe3d.visual.drawing import camera_fit, spacing_of, thin
 from geomoe3d.visual.templates import render_cloud_page
 from geomoe3d.visual.upright import upright_axes
 

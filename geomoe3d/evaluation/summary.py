@@ -15,7 +15,7 @@ import numpy as np
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.calibration import acceptance, calibrate
 from geomoe3d.evaluation.intervals import RESAMPLES, Quantity, measure_all
-from geomoe3d.evaluation.measures import RMSE_LIMIT, has_motion, score_pair
+from geomoe3d.evaluation.metrics import RMSE_LIMIT, has_motion, score_pair
 from geomoe3d.evaluation.records import (
     Curve,
     EvaluationPair,

@@ -11,11 +11,11 @@ Making the input is not on any method's clock. Clouds and features are kept for 
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -61,8 +61,8 @@ class InputMaker:
     def __init__(self, track: str, benchmark: str, root: str | Path | None = None, *, seed: int = 0) -> None:
         needs(track)
         self.track, self.seed = track, seed
-        self._clouds: _Kept[FloatArray] = _Kept(_KEPT_CLOUDS)
-        self._described: _Kept[tuple[Float32Array, Float32Array]] = _Kept(_KEPT_FEATURES)
+        self._points = lru_cache(_KEPT_CLOUDS)(_load_points)
+        self._describe = lru_cache(_KEPT_FEATURES)(_describe)
         self._fixed: dict[str, FloatArray] = {}
         self._fixed_scene = ""
         self._published = _published_folder(track, benchmark, root)
@@ -102,12 +102,6 @@ class InputMaker:
         rows = self._take_published(pair) if self._published else self._match(pair)
         return MethodInput(pair.id, correspondences=rows, seed=self.seed)
 
-    def _points(self, path: Path) -> FloatArray:
-        return self._clouds.get(path, lambda: load_fragment(path).file_points)
-
-    def _describe(self, path: Path) -> tuple[Float32Array, Float32Array]:
-        return self._described.get(path, lambda: describe_fragment(load_fragment(path), VOXEL_SIZE))
-
     def _match(self, pair: EvaluationPair) -> FloatArray:
         (points, features), (others, other_features) = (
             self._describe(pair.source),
@@ -132,6 +126,14 @@ class InputMaker:
         return self._fixed[pair.id]
 
 
+def _load_points(path: Path) -> FloatArray:
+    return load_fragment(path).file_points
+
+
+def _describe(path: Path) -> tuple[Float32Array, Float32Array]:
+    return describe_fragment(load_fragment(path), VOXEL_SIZE)
+
+
 def _hash_files(files: Collection[Path]) -> str:
     """Over names, sizes and beginnings; one that is missing counts as empty, reading it will say so."""
     total = hashlib.sha256()
@@ -141,25 +143,6 @@ def _hash_files(files: Collection[Path]) -> str:
             start, size = stream.read(_HASHED_BYTES), path.stat().st_size
         total.update(f"{path.parent.name}/{path.name} {size} ".encode() + hashlib.sha256(start).digest())
     return total.hexdigest()
-
-
-Value = TypeVar("Value")
-
-
-class _Kept(Generic[Value]):
-    """The last values made, the oldest dropped first."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._values: OrderedDict[Path, Value] = OrderedDict()
-
-    def get(self, key: Path, make: Callable[[], Value]) -> Value:
-        if key not in self._values:
-            self._values[key] = make()
-            if len(self._values) > self._size:
-                self._values.popitem(last=False)
-        self._values.move_to_end(key)
-        return self._values[key]
 
 
 def _published_folder(track: str, benchmark: str, root: str | Path | None) -> Path | None:

@@ -18,7 +18,7 @@ from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
 from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import thin
+from geomoe3d.visual.drawing import thin
 from geomoe3d.visual.templates import base64_floats, render_cloud_page
 from geomoe3d.visual.upright import upright_axes
 

@@ -19,18 +19,18 @@ from numpy.typing import NDArray
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import check_output, write_text
 from geomoe3d.types import FloatArray, IntArray
-from geomoe3d.visual.paper import number
-from geomoe3d.visual.scene import (
+from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
     REJECTED_COLOR,
     STATUS_WORDS,
-    Scene,
-    build_scene,
+    Drawing,
+    build_drawing,
     camera_fit,
     choose_rows,
     distance_to_target,
 )
+from geomoe3d.visual.paper import number
 from geomoe3d.visual.templates import base64_floats, render_cloud_page
 from geomoe3d.visual.view import RegistrationView
 
@@ -55,7 +55,7 @@ def save_page(view: RegistrationView, path: str | os.PathLike[str], *, force: bo
 
 def render_page(view: RegistrationView) -> str:
     """The text of the page that `save_page` writes; the same view gives the same text."""
-    scene = build_scene(view, max_points=MAX_POINTS)
+    drawing = build_drawing(view, max_points=MAX_POINTS)
     result = view.result
     source, target = result.source.name, result.target.name
     made_by = f"geomoe3d {result.versions.get('geomoe3d', '')}".strip()
@@ -70,50 +70,50 @@ def render_page(view: RegistrationView) -> str:
         "confidence": f"confidence {number(result.confidence, '.2f')}",
         "matrices": {key: _shown_matrix(T, result.voxel_size) for key, T in _transforms(view).items()},
         "tables": {"Numbers": _facts(view), "Time": [(k, f"{s:.3f} s") for k, s in result.seconds.items()]},
-        "drawn": _drawn(view, scene),
+        "drawn": _drawn(view, drawing),
     }
-    return render_cloud_page("visual", "page", values, _data(view, scene))
+    return render_cloud_page("visual", "page", values, _data(view, drawing))
 
 
-def _data(view: RegistrationView, scene: Scene) -> dict[str, Any]:
+def _data(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
     """What the script needs, as JSON; arrays are base64 of little-endian float32 or uint8."""
-    motions = {"before": scene.before, "answer": scene.after, "alternative": scene.alternative}
+    motions = {"before": drawing.before, "answer": drawing.after, "alternative": drawing.alternative}
     result = view.result
     limit = 2.0 * result.inlier_threshold
     if not (np.isfinite(limit) and limit > 0):  # a registration that failed before there was a threshold
-        limit = 0.1 * scene.radius
+        limit = 0.1 * drawing.radius
     distances = {
-        name: _base64_bytes(distance_to_target(view, scene, motion, limit) / limit)
+        name: _base64_bytes(distance_to_target(view, drawing, motion, limit) / limit)
         for name, motion in motions.items()
         if name != "before" and motion is not None
     }
     return {
         "source": {
-            "points": base64_floats(scene.source),
-            "colors": _colors(view.source_colors, scene.source_rows),
+            "points": base64_floats(drawing.source),
+            "colors": _colors(view.source_colors, drawing.source_rows),
         },
         "target": {
-            "points": base64_floats(scene.target),
-            "colors": _colors(view.target_colors, scene.target_rows),
+            "points": base64_floats(drawing.target),
+            "colors": _colors(view.target_colors, drawing.target_rows),
         },
-        "lines": _lines(view, scene),
+        "lines": _lines(view, drawing),
         "motions": {name: None if T is None else T.ravel().tolist() for name, T in motions.items()},
         "fits": {
-            name: camera_fit(scene.target, transform_points(T, scene.source))
+            name: camera_fit(drawing.target, transform_points(T, drawing.source))
             for name, T in motions.items()
             if T is not None
         },
         "distances": distances,
         "distanceLimit": limit,
         "matrices": {name: _matrix_text(T) for name, T in _transforms(view).items()},
-        "axes": scene.axes.tolist(),
-        "radius": scene.radius,
-        "spacing": scene.spacing,
+        "axes": drawing.axes.tolist(),
+        "radius": drawing.radius,
+        "spacing": drawing.spacing,
     }
 
 
-def _lines(view: RegistrationView, scene: Scene) -> dict[str, Any]:
-    """Correspondences, grouped by kind: each line starts in the centred source and ends in the scene."""
+def _lines(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
+    """Correspondences, grouped by kind: each line starts in the centred source and ends in the drawing."""
     seed = view.result.seed
     finite = np.isfinite(view.correspondences).all(axis=1)
     if view.groups is not None:
@@ -126,7 +126,7 @@ def _lines(view: RegistrationView, scene: Scene) -> dict[str, Any]:
         kinds = [(yes, KEPT_COLOR, kept), (no, REJECTED_COLOR, ~kept)]
     chosen = [choose_rows(mask & finite, MAX_LINES, seed) for _, _, mask in kinds]
     rows = np.concatenate([*chosen, np.zeros(0, dtype=np.int64)])
-    ends = view.correspondences[rows] - np.concatenate([scene.source_center, scene.target_center])
+    ends = view.correspondences[rows] - np.concatenate([drawing.source_center, drawing.target_center])
     classes = [
         {
             "label": label,
@@ -170,21 +170,21 @@ def _facts(view: RegistrationView) -> list[tuple[str, str]]:
     ]
 
 
-def _drawn(view: RegistrationView, scene: Scene) -> str:
+def _drawn(view: RegistrationView, drawing: Drawing) -> str:
     parts = []
     for name, drawn, points in (
-        ("source", scene.source, view.source_points),
-        ("target", scene.target, view.target_points),
+        ("source", drawing.source, view.source_points),
+        ("target", drawing.target, view.target_points),
     ):
         of_all = "all" if len(drawn) == len(points) else f"{len(drawn):,} of"
         parts.append(f"{of_all} {len(points):,} {name} points")
     text = f"Drawn: {' and '.join(parts)}"
-    if len(scene.source) < len(view.source_points) or len(scene.target) < len(view.target_points):
+    if len(drawing.source) < len(view.source_points) or len(drawing.target) < len(view.target_points):
         text += f", chosen evenly over the surface with seed {view.result.seed}"
-    text += f". Up is taken from the target's file ({scene.up_words})."
-    if scene.apart is not None:
+    text += f". Up is taken from the target's file ({drawing.up_words})."
+    if drawing.apart is not None:
         text += (
-            f" In their files the clouds lie {scene.apart:,.6g} units apart, too far to be drawn:"
+            f" In their files the clouds lie {drawing.apart:,.6g} units apart, too far to be drawn:"
             " before lays the source beside the target."
         )
     if view.has_transform:

@@ -9,6 +9,15 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import BoolArray
+from geomoe3d.visual.drawing import (
+    GROUP_COLORS,
+    KEPT_COLOR,
+    REJECTED_COLOR,
+    STATUS_COLORS,
+    STATUS_WORDS,
+    Drawing,
+    choose_rows,
+)
 from geomoe3d.visual.paper import (
     FAINT,
     INK,
@@ -22,15 +31,6 @@ from geomoe3d.visual.paper import (
     shorten,
     show,
 )
-from geomoe3d.visual.scene import (
-    GROUP_COLORS,
-    KEPT_COLOR,
-    REJECTED_COLOR,
-    STATUS_COLORS,
-    STATUS_WORDS,
-    Scene,
-    choose_rows,
-)
 from geomoe3d.visual.view import RegistrationView
 from geomoe3d.visual.xray import xray
 
@@ -40,19 +40,19 @@ if TYPE_CHECKING:
 MAX_LINES = 300
 
 
-def draw_correspondences(axes: Axes, view: RegistrationView, scene: Scene, fineness: float) -> None:
+def draw_correspondences(axes: Axes, view: RegistrationView, drawing: Drawing, fineness: float) -> None:
     """Source beside target, turned by the answer, with a line from each source to its target point.
 
     ``fineness`` is raster points per pixel.
     """
     frame(axes)
     axes.set_title("Correspondences", loc="left", fontsize=13, fontweight="bold", color=INK, pad=8)
-    if len(view.correspondences) and scene.after is not None:
+    if len(view.correspondences) and drawing.after is not None:
         note = "source laid beside target: right ones run level"
         axes.set_title(note, loc="right", fontsize=10, color=SOFT, pad=8)
-    motion = scene.before if scene.after is None else scene.after
-    source = transform_points(motion, scene.source) @ scene.axes.T
-    target = scene.target @ scene.axes.T
+    motion = drawing.before if drawing.after is None else drawing.after
+    source = transform_points(motion, drawing.source) @ drawing.axes.T
+    target = drawing.target @ drawing.axes.T
     low, high = bounds(source, target)
     extent = high - low
     panel = axes.get_window_extent()
@@ -70,14 +70,16 @@ def draw_correspondences(axes: Axes, view: RegistrationView, scene: Scene, finen
         center,
         half,
         unit / fineness,
-        scene.spacing,
+        drawing.spacing,
     )
     show(axes, 0.45 + 0.55 * image, center, half)
     if not len(view.correspondences):
         say(axes, "no correspondences were given")
         return
-    start = transform_points(motion, view.correspondences[:, :3] - scene.source_center) @ scene.axes.T - shift
-    end = (view.correspondences[:, 3:] - scene.target_center) @ scene.axes.T
+    start = (
+        transform_points(motion, view.correspondences[:, :3] - drawing.source_center) @ drawing.axes.T - shift
+    )
+    end = (view.correspondences[:, 3:] - drawing.target_center) @ drawing.axes.T
     from matplotlib.collections import LineCollection
 
     kinds = _classes(view)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import nice_length
+from geomoe3d.visual.drawing import nice_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

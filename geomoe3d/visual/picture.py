@@ -18,6 +18,14 @@ from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
+from geomoe3d.visual.drawing import (
+    SOURCE_COLOR,
+    STATUS_COLORS,
+    STATUS_WORDS,
+    TARGET_COLOR,
+    Drawing,
+    build_drawing,
+)
 from geomoe3d.visual.panels import draw_correspondences, draw_facts, draw_residuals
 from geomoe3d.visual.paper import (
     INK,
@@ -30,14 +38,6 @@ from geomoe3d.visual.paper import (
     say,
     shorten,
     show,
-)
-from geomoe3d.visual.scene import (
-    SOURCE_COLOR,
-    STATUS_COLORS,
-    STATUS_WORDS,
-    TARGET_COLOR,
-    Scene,
-    build_scene,
 )
 from geomoe3d.visual.view import RegistrationView
 from geomoe3d.visual.xray import xray
@@ -90,12 +90,12 @@ def draw_picture(view: RegistrationView, *, fineness: float = 1.0) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor="white")
-    scene = build_scene(view, max_points=MAX_POINTS)
+    drawing = build_drawing(view, max_points=MAX_POINTS)
     rows = figure.add_gridspec(
         3, 1, height_ratios=(1, 1, 1.05), left=0.02, right=0.98, top=0.895, bottom=0.04, hspace=0.16
     )
     _draw_header(figure, view)
-    for row, (title, motion, note) in enumerate(_stages(view, scene)):
+    for row, (title, motion, note) in enumerate(_stages(view, drawing)):
         cells = rows[row].subgridspec(1, 3, wspace=0.03)
         panels = [figure.add_subplot(cells[column]) for column in range(3)]
         panels[0].set_title(title, loc="left", fontsize=13, fontweight="bold", color=INK, pad=8)
@@ -103,23 +103,23 @@ def draw_picture(view: RegistrationView, *, fineness: float = 1.0) -> Figure:
         if motion is None:
             _draw_absent(panels, "no transform was found: there is nothing to show")
         else:
-            _draw_sides(figure, panels, scene, motion, fineness)
+            _draw_sides(figure, panels, drawing, motion, fineness)
     below = rows[2].subgridspec(1, 3, wspace=0.13, width_ratios=(1.22, 0.83, 0.95))
-    draw_correspondences(figure.add_subplot(below[0]), view, scene, fineness)
+    draw_correspondences(figure.add_subplot(below[0]), view, drawing, fineness)
     draw_residuals(figure.add_subplot(below[1]), view)
     draw_facts(figure.add_subplot(below[2]), view)
     return figure
 
 
-def _stages(view: RegistrationView, scene: Scene) -> list[tuple[str, FloatArray | None, str]]:
-    if scene.apart is None:
+def _stages(view: RegistrationView, drawing: Drawing) -> list[tuple[str, FloatArray | None, str]]:
+    if drawing.apart is None:
         before = "both clouds as their files give them"
     else:
-        before = f"centres {scene.apart:,.6g} units apart in the files: drawn side by side"
-    after = f"seen along the target's upright axes ({scene.up_words})"
-    if scene.after is not None:
+        before = f"centres {drawing.apart:,.6g} units apart in the files: drawn side by side"
+    after = f"seen along the target's upright axes ({drawing.up_words})"
+    if drawing.after is not None:
         after = f"dark: both clouds in one place  ·  {after}"
-    return [("Before", scene.before, before), ("After", scene.after, after)]
+    return [("Before", drawing.before, before), ("After", drawing.after, after)]
 
 
 def _draw_header(figure: Figure, view: RegistrationView) -> None:
@@ -155,13 +155,13 @@ def _draw_header(figure: Figure, view: RegistrationView) -> None:
 
 
 def _draw_sides(
-    figure: Figure, panels: list[Axes], scene: Scene, motion: FloatArray, fineness: float
+    figure: Figure, panels: list[Axes], drawing: Drawing, motion: FloatArray, fineness: float
 ) -> None:
     """The three sides of one stage, all at one scale."""
-    source = transform_points(motion, scene.source) @ scene.axes.T
-    target = scene.target @ scene.axes.T
+    source = transform_points(motion, drawing.source) @ drawing.axes.T
+    target = drawing.target @ drawing.axes.T
     low, high = bounds(source, target)
-    middle, extent = (low + high) / 2.0, np.maximum(high - low, 1e-9 * scene.radius)
+    middle, extent = (low + high) / 2.0, np.maximum(high - low, 1e-9 * drawing.radius)
     panel = panels[0].get_window_extent()
     room = 0.94 * panel.width, 0.84 * panel.height
     unit = max(  # cloud units per pixel
@@ -172,7 +172,7 @@ def _draw_sides(
         frame(axes)
         center = middle[[right, up]] - (0.0, 0.09 * half[1])  # the scale bar stands below
         image = xray(
-            source[:, [right, up]], target[:, [right, up]], center, half, unit / fineness, scene.spacing
+            source[:, [right, up]], target[:, [right, up]], center, half, unit / fineness, drawing.spacing
         )
         show(axes, image, center, half)
         text = axes.text(0.015, 0.975, title, transform=axes.transAxes, va="top", fontsize=11, color=SOFT)

@@ -1,7 +1,7 @@
 """What every display of a registration is made from: the clouds, the answer and the correspondences.
 
 `RegistrationView` holds data in the files' own coordinates and checks that its parts fit together. It
-draws nothing itself: `picture`, `page` and `window` take it, and share what `scene` derives from it.
+draws nothing itself: `picture`, `page` and `window` take it, and share what `drawing` derives from it.
 Cost: one pass over the correspondences for their residuals.
 """
 

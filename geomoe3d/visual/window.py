@@ -17,15 +17,15 @@ import numpy as np
 from geomoe3d.errors import DependencyError, OutputError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import (
+from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
     REJECTED_COLOR,
     SOURCE_COLOR,
     STATUS_WORDS,
     TARGET_COLOR,
-    Scene,
-    build_scene,
+    Drawing,
+    build_drawing,
     choose_rows,
     rgb,
 )
@@ -57,8 +57,8 @@ def show_window(view: RegistrationView) -> None:
             "'geomoe3d doctor' says what is missing"
         ) from error
 
-    scene = build_scene(view, max_points=MAX_POINTS)
-    shown = WindowContent(view, scene)
+    drawing = build_drawing(view, max_points=MAX_POINTS)
+    shown = WindowContent(view, drawing)
     window = o3d.visualization.VisualizerWithKeyCallback()
     result = view.result
     title = (
@@ -87,7 +87,7 @@ def show_window(view: RegistrationView) -> None:
             ("C", shown.switch_colors),
         ):
             window.register_key_callback(ord(key), on(change))
-        right, forward, up = scene.axes
+        right, forward, up = drawing.axes
         control = window.get_view_control()
         control.set_lookat(np.zeros(3))
         control.set_front(0.45 * right - 0.75 * forward + 0.5 * up)
@@ -101,28 +101,28 @@ def show_window(view: RegistrationView) -> None:
 class WindowContent:
     """The Open3D geometries of a view, and what the keys do to them. Opens nothing."""
 
-    def __init__(self, view: RegistrationView, scene: Scene) -> None:
+    def __init__(self, view: RegistrationView, drawing: Drawing) -> None:
         import open3d as o3d
 
         self._vectors = o3d.utility.Vector3dVector
-        self._scene = scene
-        self.motion = scene.before if scene.after is None else scene.after
+        self._drawing = drawing
+        self.motion = drawing.before if drawing.after is None else drawing.after
         self.lines_shown = True
         self.own_colors = False
         self._own = [
             None if colors is None else colors[rows]
             for colors, rows in (
-                (view.source_colors, scene.source_rows),
-                (view.target_colors, scene.target_rows),
+                (view.source_colors, drawing.source_rows),
+                (view.target_colors, drawing.target_rows),
             )
         ]
         self.source = o3d.geometry.PointCloud()
         self.target = o3d.geometry.PointCloud()
-        self.target.points = self._vectors(scene.target)
+        self.target.points = self._vectors(drawing.target)
         self.lines = o3d.geometry.LineSet()
         rows, colors = _chosen_lines(view)
-        self._starts = view.correspondences[rows, :3] - scene.source_center
-        self._ends = view.correspondences[rows, 3:] - scene.target_center
+        self._starts = view.correspondences[rows, :3] - drawing.source_center
+        self._ends = view.correspondences[rows, 3:] - drawing.target_center
         self._line_colors = colors
         pairs = np.arange(2 * len(rows)).reshape(2, -1).T
         self._pairs = o3d.utility.Vector2iVector(np.ascontiguousarray(pairs, dtype=np.int32))
@@ -132,20 +132,20 @@ class WindowContent:
 
     def geometries(self) -> list[Any]:
         """The source cloud, the target cloud and the lines, as they are to be shown now; no empty ones."""
-        candidates = ((self.source, len(self._scene.source)), (self.target, len(self._scene.target)))
+        candidates = ((self.source, len(self._drawing.source)), (self.target, len(self._drawing.target)))
         return [cloud for cloud, num in candidates if num] + ([self.lines] if len(self._starts) else [])
 
     def switch_stage(self) -> None:
         """From before to after, from anything else to before."""
-        if self._scene.after is not None:
-            self.motion = self._scene.after if self.motion is self._scene.before else self._scene.before
+        if self._drawing.after is not None:
+            self.motion = self._drawing.after if self.motion is self._drawing.before else self._drawing.before
         self._refresh()
 
     def switch_alternative(self) -> None:
         """To the alternative and back to the answer; nothing where there is no alternative."""
-        if self._scene.after is not None and self._scene.alternative is not None:
-            at_alternative = self.motion is self._scene.alternative
-            self.motion = self._scene.after if at_alternative else self._scene.alternative
+        if self._drawing.after is not None and self._drawing.alternative is not None:
+            at_alternative = self.motion is self._drawing.alternative
+            self.motion = self._drawing.after if at_alternative else self._drawing.alternative
         self._refresh()
 
     def switch_lines(self) -> None:
@@ -159,7 +159,7 @@ class WindowContent:
         self._refresh()
 
     def _refresh(self) -> None:
-        self.source.points = self._vectors(transform_points(self.motion, self._scene.source))
+        self.source.points = self._vectors(transform_points(self.motion, self._drawing.source))
         for cloud, own, plain in (
             (self.source, self._own[0], SOURCE_COLOR),
             (self.target, self._own[1], TARGET_COLOR),

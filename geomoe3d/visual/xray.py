@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.scene import SOURCE_COLOR, TARGET_COLOR, rgb
+from geomoe3d.visual.drawing import SOURCE_COLOR, TARGET_COLOR, rgb
 
 
 def xray(

@@ -15,7 +15,7 @@ from geomoe3d.evaluation.records import EvaluationPair, RunInfo
 
 
 @dataclass(frozen=True)
-class Task:
+class EvaluationSet:
     """What a set of predictions is made on.
 
     Folders become absolute, so that a run is scored from any other folder, too.
@@ -59,11 +59,13 @@ def load_run_pairs(info: RunInfo) -> list[EvaluationPair]:
     """
     try:
         given = info.identity["pairs"]
-        task = Task(given["benchmark"], info.track, given["root"], given["every"], given["num_unrelated"])
+        chosen = EvaluationSet(
+            given["benchmark"], info.track, given["root"], given["every"], given["num_unrelated"]
+        )
         expected = given["fingerprint"]
     except (KeyError, TypeError):
         raise FormatError(f"run '{info.label}' does not say which pairs it was made on") from None
-    pairs = task.pairs()
+    pairs = chosen.pairs()
     if fingerprint(pairs) != expected:
         raise InputError(
             f"the ground truth of '{info.benchmark}' is not the one that run '{info.label}' was predicted "

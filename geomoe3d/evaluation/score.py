@@ -13,18 +13,18 @@ from pathlib import Path
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison, compare
+from geomoe3d.evaluation.evaluation_set import load_run_pairs
+from geomoe3d.evaluation.predictions import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 from geomoe3d.evaluation.report_text import run_key, to_json, to_markdown
-from geomoe3d.evaluation.store import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.summary import summarise
-from geomoe3d.evaluation.task import load_run_pairs
 from geomoe3d.runtime.files import write_text
 
 REPORT_SUFFIXES = (".html", ".md", ".json")
 
 
 @dataclass(frozen=True)
-class StudiedRun:
+class ScoredRun:
     """A run with all that its reports need.
 
     Attributes:
@@ -40,9 +40,9 @@ class StudiedRun:
     score: RunScore
 
 
-def score_study(
+def score_runs(
     study: str | Path, *, raw_truth: bool = False, progress: Callable[[int, int], None] | None = None
-) -> list[StudiedRun]:
+) -> list[ScoredRun]:
     """Score every run of a study, or the one run that the folder is.
 
     Args:
@@ -62,13 +62,13 @@ def score_study(
         info, predictions = read_info(folder), read_predictions(folder)
         pairs = load_run_pairs(info)
         score = summarise(info, pairs, predictions, raw_truth=raw_truth)
-        runs.append(StudiedRun(folder, pairs, predictions, score))
+        runs.append(ScoredRun(folder, pairs, predictions, score))
     if progress is not None:
         progress(len(folders), len(folders))
     return runs
 
 
-def compare_all(runs: list[StudiedRun]) -> list[Comparison]:
+def compare_all(runs: list[ScoredRun]) -> list[Comparison]:
     """Every two runs on the same pairs and track, against each other."""
     return [
         compare(one.score, other.score)
@@ -77,7 +77,7 @@ def compare_all(runs: list[StudiedRun]) -> list[Comparison]:
     ]
 
 
-def write_report(path: str | Path, runs: list[StudiedRun], *, force: bool = False) -> None:
+def write_report(path: str | Path, runs: list[ScoredRun], *, force: bool = False) -> None:
     """Write a report; the suffix decides: .html to look at, .md to quote, .json to compute with.
 
     Raises:
@@ -104,6 +104,6 @@ def write_report(path: str | Path, runs: list[StudiedRun], *, force: bool = Fals
     write_text(path, text.rstrip() + "\n", force=force)
 
 
-def _task_of(run: StudiedRun) -> tuple[str, str, str]:
+def _task_of(run: ScoredRun) -> tuple[str, str, str]:
     info = run.score.info
     return info.track, info.benchmark, str(info.identity.get("pairs"))

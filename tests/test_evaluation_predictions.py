@@ -10,8 +10,8 @@ from fake_methods import Fake, load_like
 from posed_scans import motion
 
 from geomoe3d.evaluation.predict import predict_one
+from geomoe3d.evaluation.predictions import decode, encode
 from geomoe3d.evaluation.records import Answer, MethodInput
-from geomoe3d.evaluation.store import decode, encode
 from geomoe3d.geometry.se3 import transform_points
 
 

@@ -21,6 +21,7 @@ from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.journal import Journal, read_journal
+from geomoe3d.runtime.provenance import differences
 from geomoe3d.types import BoolArray, FloatArray
 
 RUN_FILE = "run.json"
@@ -40,7 +41,7 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
     except OSError as error:
         raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
     if (folder / RUN_FILE).is_file():
-        differing = _differences(read_info(folder), info)
+        differing = differences(_compared(read_info(folder)), _compared(info))
         if differing:
             raise InputError(
                 f"'{folder}' holds predictions of another run; they differ in {'; '.join(differing)}. "
@@ -202,24 +203,7 @@ def _halves(weights: FloatArray) -> str:
     return base64.b64encode(np.asarray(weights).astype("<f2").tobytes()).decode("ascii")
 
 
-def _differences(stored: RunInfo, wanted: RunInfo) -> list[str]:
-    """What decides predictions and differs, in words. Commit, hardware and time are told, not compared."""
-    old = {"method": stored.method, "track": stored.track, "benchmark": stored.benchmark, "seed": stored.seed}
-    new = {"method": wanted.method, "track": wanted.track, "benchmark": wanted.benchmark, "seed": wanted.seed}
-    pairs = {**_flat(old), **_flat(stored.identity)}, {**_flat(new), **_flat(wanted.identity)}
-    keys = sorted(pairs[0].keys() | pairs[1].keys())
-    return [
-        f"{key} ({pairs[0].get(key)} there, {pairs[1].get(key)} now)"
-        for key in keys
-        if pairs[0].get(key) != pairs[1].get(key)
-    ]
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    rows: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            rows.update(_flat(value, f"{prefix}{key}."))
-        else:
-            rows[prefix + key] = json.dumps(value, sort_keys=True)
-    return rows
+def _compared(info: RunInfo) -> dict[str, Any]:
+    """What decides predictions. Commit, hardware and time are told, not compared."""
+    named = {"method name": info.method, "track": info.track, "benchmark": info.benchmark, "seed": info.seed}
+    return {**info.identity, **named}

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.data.threedmatch import find_data_root, load_benchmark
 from geomoe3d.errors import InputError
-from geomoe3d.evaluation.measures import (
+from geomoe3d.evaluation.metrics import (
     benchmark_rmse,
     has_motion,
     is_right,

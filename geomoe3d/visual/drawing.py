@@ -35,8 +35,8 @@ MAX_DISTANCE_POINTS = 200_000
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Points and motions in *scene* coordinates: the target's file axes, about the target's centre.
+class Drawing:
+    """Points and motions in *drawing* coordinates: the target's file axes, about the target's centre.
 
     Attributes:
         source: (n, 3) source points minus ``source_center``, the source's file axes.
@@ -45,12 +45,12 @@ class Scene:
         target_rows: (m,) rows of the view's target_points that are drawn.
         source_center: (3,) source file coordinates.
         target_center: (3,) target file coordinates.
-        before: (4, 4) centred source -> scene, nothing aligned.
-        after: (4, 4) centred source -> scene by the answer, or None where there is none.
+        before: (4, 4) centred source -> drawing, nothing aligned.
+        after: (4, 4) centred source -> drawing by the answer, or None where there is none.
         alternative: (4, 4) the same by the second hypothesis, or None.
         apart: distance of the two centres in the files where it is too far to be drawn; ``before`` then
             lays the source beside the target. None where ``before`` is what the files say.
-        axes: (3, 3) rows right, forward, up in scene coordinates, in which the target looks upright.
+        axes: (3, 3) rows right, forward, up in drawing coordinates, in which the target looks upright.
         up_words: the convention of the target's file, e.g. "z up".
         radius: half the size of the target and the moved source, cloud units, more than 0.
         spacing: typical distance between neighbouring drawn points, cloud units, more than 0.
@@ -72,7 +72,7 @@ class Scene:
     spacing: float
 
 
-def build_scene(view: RegistrationView, *, max_points: int) -> Scene:
+def build_drawing(view: RegistrationView, *, max_points: int) -> Drawing:
     """Thin (seeded), centre and orient the clouds of a view.
 
     Args:
@@ -105,7 +105,7 @@ def build_scene(view: RegistrationView, *, max_points: int) -> Scene:
     shown = [target]
     if len(source):
         shown.append(transform_points(before if after is None else after, source))
-    return Scene(
+    return Drawing(
         source=source,
         target=target,
         source_rows=source_rows,
@@ -160,7 +160,9 @@ def _cell_keys(points: FloatArray, cell: float) -> IntArray:
     return np.asarray(np.floor(points / cell).astype(np.int64) @ np.array([73856093, 19349663, 83492791]))
 
 
-def distance_to_target(view: RegistrationView, scene: Scene, motion: FloatArray, limit: float) -> FloatArray:
+def distance_to_target(
+    view: RegistrationView, drawing: Drawing, motion: FloatArray, limit: float
+) -> FloatArray:
     """(n,) distance of each drawn, moved source point to the nearest target point, cloud units.
 
     The target is represented by at most 200k random points. Infinite where no target point lies within
@@ -170,12 +172,12 @@ def distance_to_target(view: RegistrationView, scene: Scene, motion: FloatArray,
 
     rng = np.random.default_rng(view.result.seed)
     target = view.target_points[np.isfinite(view.target_points).all(axis=1)]
-    if not len(target) or not len(scene.source):
-        return np.full(len(scene.source), np.inf)
+    if not len(target) or not len(drawing.source):
+        return np.full(len(drawing.source), np.inf)
     if len(target) > MAX_DISTANCE_POINTS:
         target = target[rng.choice(len(target), MAX_DISTANCE_POINTS, replace=False)]
-    distance, _ = cKDTree(target - scene.target_center).query(
-        transform_points(motion, scene.source), distance_upper_bound=limit
+    distance, _ = cKDTree(target - drawing.target_center).query(
+        transform_points(motion, drawing.source), distance_upper_bound=limit
     )
     return np.asarray(distance)
 

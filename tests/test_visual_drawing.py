@@ -10,7 +10,7 @@ from registration_views import UTM, room_view
 
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.result import Alternative
-from geomoe3d.visual.scene import build_scene, distance_to_target, nice_length, thin
+from geomoe3d.visual.drawing import build_drawing, distance_to_target, nice_length, thin
 
 
 def test_thinning_is_even_seeded_bounded_and_finite():
@@ -38,7 +38,7 @@ def test_scene_motions_survive_single_precision(origin):
         view.result.T_target_source @ make_transform(np.diag([-1.0, -1, 1]), np.zeros(3)), 0.9, 180.0, 1.0
     )
     view = replace(view, result=replace(view.result, alternative=alternative))
-    scene = build_scene(view, max_points=2000)
+    scene = build_drawing(view, max_points=2000)
     source = view.source_points[scene.source_rows]
     for motion, T in (
         (scene.after, view.result.T_target_source),
@@ -62,7 +62,7 @@ def test_scene_motions_survive_single_precision(origin):
 
 def test_distance_to_target_against_brute_force():
     view = room_view(UTM, num=1000)
-    scene = build_scene(view, max_points=1000)
+    scene = build_drawing(view, max_points=1000)
     found = distance_to_target(view, scene, scene.after, 0.3)
     moved = view.result.apply(view.source_points[scene.source_rows])
     brute = np.linalg.norm(moved[:, None] - view.target_points[None], axis=2).min(axis=1)

@@ -83,7 +83,7 @@ def make_method(spec: str, assignments: Sequence[str] = ()) -> Method:
     if spec in OURS:
         return OurMethod(spec, assignments)
     if spec in PEERS:
-        return PEERS[spec]()
+        return PEERS[spec]
     if ":" in spec:
         return AdaptedFunction(spec)
     close = difflib.get_close_matches(spec.lower(), method_names(), n=1, cutoff=0.4)

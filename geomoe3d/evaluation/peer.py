@@ -1,8 +1,9 @@
 """What all of other people's methods share: recentring, settings, versions, and being absent.
 
-A library is imported when its peer is asked for; one that is not installed, or cannot be loaded, makes the
-peer absent, never a failure. Clouds and correspondences are recentred first, because some of these libraries
-compute in single precision. Place: below `peers` and `open3d_peers`.
+A peer is a function of two clouds or of corresponding points and its settings, registered by the decorator
+`peer`. A library is imported when its peer is asked for; one that is not installed, or cannot be loaded,
+makes the peer absent, never a failure. Clouds and correspondences are recentred first, because some of
+these libraries compute in single precision. Place: below `peers` and `open3d_peers`.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,43 +24,56 @@ from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import make_transform, project_to_so3, shift_frames
-from geomoe3d.types import FloatArray
 
 CORRESPONDENCES = frozenset({"correspondences"})
 CLOUDS = frozenset({"clouds"})
 LEAST_MATCHED = 10
 """Points in contact below which a local method has found nothing."""
 
-_NO_SETTINGS = ("name", "inputs", "module", "distributions")
+Register = Callable[..., Answer]
+"""Source (N, 3), target (M, 3), both recentred, the `MethodInput` (thresholds, voxel size, seed), settings by
+name -> answer."""
+
+PEERS: dict[str, Peer] = {}
+"""Peers by the name of the command line; complete once `geomoe3d.evaluation.peers` is imported."""
 
 
-@dataclass(kw_only=True)
+@dataclass
 class Peer:
-    """What all peers share; further fields of a subclass are its settings.
+    """Another method as a `Method`.
 
     Attributes:
         name: as on the command line.
-        inputs: as in `Method`.
         module: what is imported.
         distributions: whose versions decide the answers; those that are not installed are left out.
-        common_origin: True for local methods: both clouds are shifted alike, so that the start stays the
-            identity of the files' own coordinates.
+        inputs: as in `Method`.
+        register: the method itself.
+        settings: its keywords.
+        local: both clouds are shifted alike, so that the start stays the identity of the files' own
+            coordinates.
         limits: where the library can be installed, if not everywhere.
     """
 
     name: str
-    inputs: frozenset[str]
     module: str
     distributions: tuple[str, ...]
-    common_origin: ClassVar[bool] = False
-    limits: ClassVar[str] = ""
+    inputs: frozenset[str]
+    register: Register
+    settings: dict[str, Any]
+    local: bool = False
+    limits: str = ""
+
+    def with_settings(self, **changes: Any) -> Peer:
+        """The same peer with some settings changed."""
+        return replace(self, settings={**self.settings, **changes})
 
     def identity(self) -> dict[str, Any]:
         """Settings, versions of the libraries, and the hash of the files that define the peer."""
+        files = [Path(__file__), Path(inspect.getfile(self.register))]
         return {
-            "settings": {key: value for key, value in asdict(self).items() if key not in _NO_SETTINGS},
+            "settings": self.settings,
             "versions": versions("numpy", *self.distributions),
-            "source_sha256": _source_hash(type(self)),
+            "source_sha256": hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest(),
         }
 
     def absent(self) -> str | None:
@@ -92,9 +107,9 @@ class Peer:
         if min(len(source), len(target)) < 3:
             return Answer(None)
         far = choose_origin(target)
-        origins = (far if self.common_origin else choose_origin(source)), far
+        origins = (far if self.local else choose_origin(source)), far
         try:
-            answer = self.register(source - origins[0], target - origins[1], given)
+            answer = self.register(source - origins[0], target - origins[1], given, **self.settings)
         except GeoMoE3DError:
             raise
         except Exception as error:  # a library's complaint of one pair must not end all the others
@@ -105,9 +120,26 @@ class Peer:
         T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
         return Answer(shift_frames(T, *origins), inliers=answer.inliers, stages=answer.stages)
 
-    def register(self, source: FloatArray, target: FloatArray, given: MethodInput) -> Answer:
-        """The peer itself on recentred points (N, 3); thresholds, voxel size and seed are in ``given``."""
-        raise NotImplementedError
+
+def peer(
+    name: str,
+    module: str,
+    *distributions: str,
+    inputs: frozenset[str],
+    local: bool = False,
+    limits: str = "",
+    **settings: Any,
+) -> Callable[[Register], Register]:
+    """Registers a function as a peer, see `Peer`; its settings are the function's keywords and these."""
+
+    def add(register: Register) -> Register:
+        keywords = inspect.signature(register).parameters.values()
+        defaults = {k.name: k.default for k in keywords if k.kind is inspect.Parameter.KEYWORD_ONLY}
+        found = {**defaults, **settings}
+        PEERS[name] = Peer(name, module, distributions, inputs, register, found, local, limits)
+        return register
+
+    return add
 
 
 def versions(*distributions: str) -> dict[str, str]:
@@ -119,12 +151,3 @@ def versions(*distributions: str) -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def _source_hash(peer: type[Peer]) -> str:
-    """Over the files of the class and its bases in this package."""
-    files = {inspect.getsourcefile(kind) for kind in peer.__mro__ if issubclass(kind, Peer)}
-    total = hashlib.sha256()
-    for file in sorted(file for file in files if file is not None):
-        total.update(Path(file).read_bytes())
-    return total.hexdigest()

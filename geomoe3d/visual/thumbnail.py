@@ -50,7 +50,7 @@ def pair_thumbnail(
     from matplotlib.image import imsave
 
     buffer = io.BytesIO()
-    imsave(buffer, pixels, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
+    imsave(buffer, pixels, format="png", pil_kwargs={"optimize": True})
     return buffer.getvalue()
 
 

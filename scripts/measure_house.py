@@ -1,0 +1,140 @@
+"""What the package is made of: lines per room, largest files, constants outside the configuration, circles.
+
+    python scripts/measure_house.py [--constants]
+
+A constant is a number, or a tuple, list, set or mapping of numbers, that is given a name at the level of a
+module; ``config.py`` files, which hold the configuration, are left out. A circle is a set of files each of
+which imports, directly or through others, all of the others; imports inside functions count, those for type
+checkers alone do not.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "geomoe3d"
+
+
+@click.command()
+@click.option("--most", default=12, show_default=True, help="Largest files that are listed.")
+@click.option("--constants", "list_constants", is_flag=True, help="List every constant with its place.")
+def main(most: int, list_constants: bool) -> None:
+    """Print what the package is made of."""
+    files = {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+    trees = {path: ast.parse(text) for path, text in files.items()}
+    lines = {path: text.count("\n") for path, text in files.items()}
+    rooms: dict[str, int] = {}
+    for path, count in lines.items():
+        parts = path.relative_to(PACKAGE).parts
+        room = parts[0] if len(parts) > 1 else "(root)"
+        rooms[room] = rooms.get(room, 0) + count
+    for room, count in sorted(rooms.items(), key=lambda item: -item[1]):
+        click.echo(f"{count:7,}  {room}")
+    click.echo(f"{sum(lines.values()):7,}  lines in {len(files)} files\n")
+    for path, count in sorted(lines.items(), key=lambda item: -item[1])[:most]:
+        click.echo(f"{count:7,}  {path.relative_to(PACKAGE)}")
+    found = [
+        f"{path.relative_to(PACKAGE)}:{line} {name}"
+        for path, tree in trees.items()
+        if path.name != "config.py"
+        for name, line in constants(tree)
+    ]
+    click.echo(f"\n{len(found):7,}  numeric constants of modules outside the configuration")
+    for place in found if list_constants else ():
+        click.echo(f"         {place}")
+    circles = import_circles(trees)
+    click.echo(f"{len(circles):7,}  import circles between files")
+    for circle in circles:
+        click.echo(f"         {', '.join(circle)}")
+    at_root = sorted(path.name for path in files if path.parent == PACKAGE)
+    click.echo(f"{len(at_root):7,}  Python files at the package's root: {', '.join(at_root)}")
+
+
+def constants(tree: ast.Module) -> Iterator[tuple[str, int]]:
+    """Name and line of every numeric constant at the level of a module."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign):
+            targets, value = node.targets, node.value
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            targets, value = [node.target], node.value
+        else:
+            continue
+        for target in targets:
+            names = target.elts if isinstance(target, ast.Tuple) else [target]
+            values = value.elts if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) else [value]
+            for name, one in zip(names, values, strict=False):
+                if isinstance(name, ast.Name) and is_numeric(one):
+                    yield name.id, node.lineno
+
+
+def is_numeric(node: ast.expr) -> bool:
+    """Whether an expression is made of written numbers alone: arithmetic, tuples, values of a mapping."""
+    match node:
+        case ast.Constant(value=bool()):
+            return False
+        case ast.Constant(value=int() | float()):
+            return True
+        case ast.UnaryOp(operand=operand):
+            return is_numeric(operand)
+        case ast.BinOp(left=left, right=right):
+            return is_numeric(left) and is_numeric(right)
+        case ast.Tuple(elts=parts) | ast.List(elts=parts) | ast.Set(elts=parts) | ast.Dict(values=parts):
+            return bool(parts) and all(map(is_numeric, parts))
+        case ast.Call(args=[inside]):  # np.array([...]), frozenset({...})
+            return is_numeric(inside)
+    return False
+
+
+def import_circles(trees: dict[Path, ast.Module]) -> list[list[str]]:
+    """Every set of files that import each other, as module names."""
+    names = {module_name(path): path for path in trees}
+    graph = {name: set(imported(trees[path], names)) - {name} for name, path in names.items()}
+    reach = {name: reachable(name, graph) for name in graph}
+    circles = {
+        frozenset(other for other in reach[name] if name in reach[other])
+        for name in graph
+        if name in reach[name]
+    }
+    return sorted(sorted(circle) for circle in circles)
+
+
+def module_name(path: Path) -> str:
+    """The module in a file of the package, such as ``geomoe3d.batch.run``."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported(tree: ast.Module, known: dict[str, Path]) -> Iterator[str]:
+    """Modules of the package that a file imports when it is loaded or at work."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in known)
+        elif isinstance(node, ast.ImportFrom) and node.module in known:
+            for alias in node.names:
+                inside = f"{node.module}.{alias.name}"
+                yield inside if inside in known else node.module
+        waiting += ast.iter_child_nodes(node)
+
+
+def reachable(start: str, graph: dict[str, set[str]]) -> set[str]:
+    """Everything that a module imports, directly or through others."""
+    found: set[str] = set()
+    waiting = [start]
+    while waiting:
+        for name in graph[waiting.pop()] - found:
+            found.add(name)
+            waiting.append(name)
+    return found
+
+
+if __name__ == "__main__":
+    main()

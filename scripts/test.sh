@@ -17,9 +17,20 @@ install_browser() {
   fi
 }
 
+# Programs that open the files written here.
+install_consumers() {
+  if command -v pcl_voxel_grid >/dev/null && command -v CloudCompare >/dev/null; then return; fi
+  if command -v apt-get >/dev/null; then
+    install_packages pcl-tools cloudcompare
+  else
+    say "no apt-get here: the tests with the Point Cloud Library's programs and CloudCompare will be skipped"
+  fi
+}
+
 set_up
-install_package dev,las,e57,train,dask,peers
+install_package dev,las,e57,train,dask,peers,consumers
 install_browser
+install_consumers
 
 cd "$checkout"
 say "ruff"

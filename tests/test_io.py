@@ -52,7 +52,7 @@ def test_round_trip_keeps_points_normals_and_colors(tmp_path: Path, suffix: str,
         if np.rint(colors * 255).any():  # an entirely black LAS is one without colours
             np.testing.assert_allclose(loaded.colors, colors, atol=0.5 / 255 + 1e-12)
     else:
-        atol = 0.5 / 255 + 1e-12 if suffix in (".ply", ".pcd") else 0.0
+        atol = 0.5 / 255 + 1e-12 if suffix in (".ply", ".pcd", ".e57") else 0.0
         assert loaded.colors is not None
         np.testing.assert_allclose(loaded.colors, colors, rtol=0, atol=atol)
 

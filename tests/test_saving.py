@@ -227,7 +227,7 @@ def test_output_places_that_do_not_work(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / "none" / "a.ply", OutputError, "does not exist"),
         (tmp_path / "folder.ply", OutputError, "it is a folder"),
         (tmp_path / "a.plyy", FormatError, "did you mean .ply?"),
-        (tmp_path / "a.e57", FormatError, ", ".join(WRITABLE_SUFFIXES)),
+        (tmp_path / "a.e58", FormatError, ", ".join(WRITABLE_SUFFIXES)),
         (tmp_path / "a", FormatError, "no suffix"),
     ):
         for call in (

@@ -108,8 +108,8 @@ def turned() -> tuple[str, ...]:
     return (
         f"rosrun tf static_transform_publisher {a} {b} {c} {x} {y} {z} {w} map scan 100",
         f"rosrun tf2_ros static_transform_publisher {a} {b} {c} {yaw} {pitch} {roll} map scan",
-        f"ros2 run tf2_ros static_transform_publisher --x {a} --y {b} --z {c} \\\n --yaw {yaw} --pitch {pitch} "
-        f"--roll {roll} --frame-id map",
+        f"ros2 run tf2_ros static_transform_publisher --x {a} --y {b} --z {c} \\\n"
+        f" --yaw {yaw} --pitch {pitch} --roll {roll} --frame-id map",
         "transforms:\n- header: {frame_id: map}\n  transform:\n"
         f"    translation: {place}\n    rotation: {turn}\n",
         f"pose:\n  position: {place}\n  orientation: {turn}\n",

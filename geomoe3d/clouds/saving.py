@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.clouds.formats import gltf, las, meshes
+from geomoe3d.clouds.formats import e57, gltf, las, meshes
 from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS
@@ -78,7 +78,7 @@ def save_points(
     1/255 when all are nearly black), exactly by text and NPZ.
 
     Args:
-        path: .ply, .pcd, .xyz, .txt, .csv, .npy, .npz, .las or .laz.
+        path: .ply, .pcd, .xyz, .txt, .asc, .csv, .npy, .npz, .las, .laz or .e57.
         points: (N, 3) finite, N >= 1.
         normals: (N, 3) finite or None.
         colors: (N, 3) in [0, 1] or None.
@@ -139,6 +139,8 @@ def check_aligned(
         )
     if suffix in (".las", ".laz"):
         las.require_laspy(suffix == ".laz")
+    if suffix == ".e57":
+        e57.require_pye57()
     if suffix not in WRITABLE_SUFFIXES and read_raw(source).faces is None:
         raise FormatError(
             f"'{path}': {suffix} holds meshes, but {describe(source)} is a cloud; writable: "

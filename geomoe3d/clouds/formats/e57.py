@@ -1,19 +1,21 @@
-"""E57 (extra ``geomoe3d[e57]``, pye57): all scans of a file in its global frame, read only.
+"""E57 (extra ``geomoe3d[e57]``, pye57): all scans of a file in its global frame, and posed scans as a file.
 
-Fields are read as doubles through libE57 itself; pye57's own reader assumes 8 bit colours and an order of
-the quaternion's members. Its writer stores single precision, so E57 is not written.
+Fields are read and written as doubles through libE57 itself: pye57's own reader assumes 8 bit colours and an
+order of the quaternion's members, and its writer stores single precision.
 """
 
 from __future__ import annotations
 
 import struct
+import uuid
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
-from geomoe3d.clouds.formats.registry import reader
+from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import DependencyError, FormatError
 from geomoe3d.types import FloatArray
 
@@ -21,6 +23,19 @@ _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
+
+
+def require_pye57() -> Any:
+    """The module pye57.
+
+    Raises:
+        DependencyError: it is not installed.
+    """
+    try:
+        import pye57
+    except ImportError:
+        raise DependencyError("E57 files need pye57, which is not installed: pip install pye57") from None
+    return pye57
 
 
 @reader(".e57")
@@ -34,10 +49,7 @@ def read_e57(path: Path) -> RawCloud:
         FormatError: no E57 file, truncated, or damaged.
         DependencyError: pye57 is absent.
     """
-    try:
-        import pye57
-    except ImportError:
-        raise DependencyError("E57 files need pye57, which is not installed: pip install pye57") from None
+    pye57 = require_pye57()
     _check_size(path)
     try:
         with pye57.E57(str(path)) as file:
@@ -161,3 +173,87 @@ def _scaled_colors(node: Any, colors: FloatArray) -> FloatArray | None:
         if limit > 0 and colors.min() >= 0 and colors.max() <= limit:
             return colors / limit
     return scale_colors(colors)
+
+
+_SURFACE_NORMALS = "http://www.libe57.org/E57_NOR_surface_normals.txt"
+
+
+@writer(".e57")
+def write_e57(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
+    """One scan in the file's frame; see `write_scans`."""
+    return write_scans(Path(handle.name), [("cloud", cloud, np.eye(4))])
+
+
+def write_scans(path: Path, scans: Sequence[tuple[str, RawCloud, FloatArray]]) -> tuple[str, ...]:
+    """An E57 file of posed scans: double coordinates, 8 bit colours, normals, intensity and time.
+
+    Args:
+        path: replaced if it is there.
+        scans: name, points in the scan's own frame, and pose (4, 4): p_file = R p_scan + t.
+
+    Returns:
+        Names of what the scans hold and E57 has no place for.
+
+    Raises:
+        DependencyError: pye57 is absent.
+    """
+    from scipy.spatial.transform import Rotation
+
+    pye57 = require_pye57()
+    lib = pye57.libe57
+    lost: list[str] = []
+    with pye57.E57(str(path), mode="w") as file:
+        image = file.image_file
+        if any(cloud.normals is not None for _, cloud, _ in scans):
+            image.extensionsAdd("nor", _SURFACE_NORMALS)
+
+        def structure(parent: Any, name: str, values: dict[str, float]) -> None:
+            node = lib.StructureNode(image)
+            parent.set(name, node)
+            for key, value in values.items():
+                node.set(key, lib.FloatNode(image, float(value)))
+
+        for name, cloud, T in scans:
+            scan = lib.StructureNode(image)
+            scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid5(uuid.NAMESPACE_URL, name)}}}"))
+            scan.set("name", lib.StringNode(image, name))
+            pose = lib.StructureNode(image)
+            scan.set("pose", pose)
+            x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+            structure(pose, "rotation", {"w": w, "x": x, "y": y, "z": z})
+            structure(pose, "translation", dict(zip("xyz", T[:3, 3], strict=True)))
+            columns = dict(zip(_CARTESIAN, cloud.points.T, strict=True))
+            if cloud.normals is not None:
+                columns.update(zip(_NORMALS, cloud.normals.T, strict=True))
+            for field in ("intensity", "timeStamp"):
+                if field in cloud.fields:
+                    columns[field] = cloud.fields[field]
+            lost += [field for field in cloud.fields if field not in columns]
+            if "intensity" in columns:
+                low, high = float(columns["intensity"].min()), float(columns["intensity"].max())
+                structure(scan, "intensityLimits", {"intensityMinimum": low, "intensityMaximum": high})
+            prototype = lib.StructureNode(image)
+            for field in columns:
+                prototype.set(field, lib.FloatNode(image, 0.0, lib.E57_DOUBLE))
+            if cloud.colors is not None:
+                columns.update(zip(_COLORS, np.rint(cloud.colors * 255.0).T, strict=True))
+                for field in _COLORS:
+                    prototype.set(field, lib.IntegerNode(image, 0, 0, 255))
+                limits = lib.StructureNode(image)
+                scan.set("colorLimits", limits)
+                for field in _COLORS:
+                    limits.set(f"{field}Minimum", lib.IntegerNode(image, 0))
+                    limits.set(f"{field}Maximum", lib.IntegerNode(image, 255))
+            points = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
+            scan.set("points", points)
+            file.data3d.append(scan)
+            buffers = lib.VectorSourceDestBuffer()
+            held = {
+                field: np.ascontiguousarray(column, dtype=np.float64) for field, column in columns.items()
+            }
+            for field, column in held.items():
+                buffers.append(lib.SourceDestBuffer(image, field, column, len(column), True, True))
+            writing = points.writer(buffers)
+            writing.write(len(cloud.points))
+            writing.close()
+    return tuple(dict.fromkeys(lost))

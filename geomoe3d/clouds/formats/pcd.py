@@ -173,9 +173,11 @@ def _read_binary(handle: BinaryIO, path: Path, header: _Header) -> list[NDArray[
     itemsize = header.dtype.itemsize
     rest = path.stat().st_size - handle.tell()
     surplus = rest - header.num_points * itemsize
-    if surplus < 0 or surplus >= itemsize:
+    if surplus < 0:
         raise wrong_count(path, header.num_points, rest // itemsize)
     rows = np.fromfile(handle, dtype=header.dtype, count=header.num_points)
+    if surplus >= itemsize and np.fromfile(handle, dtype=np.uint8).any():  # PCL pads with a page of zeros
+        raise wrong_count(path, header.num_points, rest // itemsize)
     _check_end(handle, path)
     return [rows[f"f{k}"] for k in range(len(header.names))]
 

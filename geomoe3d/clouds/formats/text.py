@@ -187,7 +187,7 @@ def _read_table(path: Path, handle: IO[str]) -> RawCloud:
     for line in lines:
         body = line.lstrip("#/ \t")
         delimiter = _delimiter(body)
-        tokens = [token.strip() for token in body.rstrip(delimiter).split(delimiter)]
+        tokens = [token.strip() for token in body.rstrip(delimiter).split(delimiter)] or [""]
         if line.startswith(_COMMENTS):
             if "points" in columns_by_name(tokens):
                 remark = tokens
@@ -260,10 +260,19 @@ def _is_number(token: str) -> bool:
     return True
 
 
-@writer(".xyz", ".txt", ".asc")
+@writer(".xyz", ".txt")
 def write_blanks(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
-    """As `write_csv` with blanks between the columns; the header is a remark, and only there if needed."""
-    return _write_text(handle, cloud, " ")
+    """As `write_csv` with blanks between the columns; the header is a remark, and only there if needed.
+
+    No blank may follow the #: CloudCompare would count one column more than the rows have, and find no point.
+    """
+    return _write_text(handle, cloud, " ", "#")
+
+
+@writer(".asc")
+def write_asc(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
+    """As `write_blanks`, with the header in which CloudCompare finds colours too."""
+    return _write_text(handle, cloud, " ", "//")
 
 
 @writer(".csv")
@@ -272,23 +281,23 @@ def write_csv(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
 
     Normals, colours (fractions in [0, 1]) and fields follow the coordinates.
     """
-    return _write_text(handle, cloud, ",")
+    return _write_text(handle, cloud, ",", "")
 
 
-def _write_text(handle: BinaryIO, cloud: RawCloud, separator: str) -> tuple[str, ...]:
-    names = ["x", "y", "z"]
+def _write_text(handle: BinaryIO, cloud: RawCloud, separator: str, remark: str) -> tuple[str, ...]:
+    names = ["X", "Y", "Z"]
     parts: list[NDArray[Any]] = [cloud.points]
     if cloud.normals is not None:
-        names += ["nx", "ny", "nz"]
+        names += ["Nx", "Ny", "Nz"]
         parts.append(cloud.normals)
     if cloud.colors is not None:
-        names += ["red", "green", "blue"]
+        names += ["Rf", "Gf", "Bf"]
         parts.append(cloud.colors)
     for name, values in cloud.fields.items():
         names.append(re.sub(r"[\s,;]+", "_", name))
         parts.append(values[:, None])
-    if separator == "," or len(names) > 3:
-        handle.write((("" if separator == "," else "# ") + separator.join(names) + "\n").encode())
+    if not remark or len(names) > 3:
+        handle.write((remark + separator.join(names) + "\n").encode())
     write_rows(handle, parts, separator)
     return ()
 

@@ -77,16 +77,16 @@ class Finding:
     Attributes:
         name: what was looked at.
         state: ok, missing or broken.
-        required: whether registration needs it.
         detail: version, or what is wrong.
         mend: the command (or, where no command can, the step) that mends it; None when ok.
+        required: whether registration needs it.
     """
 
     name: str
     state: State
-    required: bool
     detail: str
     mend: str | None = None
+    required: bool = True
 
 
 def examine(machine: Machine | None = None) -> list[Finding]:
@@ -97,24 +97,19 @@ def examine(machine: Machine | None = None) -> list[Finding]:
     """
     machine = machine or Machine()
     with ThreadPoolExecutor(max_workers=4) as pool:
+        libraries = [(module, requirement, "") for module, requirement in REQUIRED_MODULES.items()]
+        extras = [(module, *wanted) for module, wanted in OPTIONAL_MODULES.items()]
         torch = pool.submit(_check_torch, machine)
         open3d = pool.submit(_check_open3d, machine)
-        modules = [
-            pool.submit(_check_module, machine, module, requirement, True, "")
-            for module, requirement in REQUIRED_MODULES.items()
-        ]
-        extras = [
-            pool.submit(_check_module, machine, module, requirement, False, purpose)
-            for module, (requirement, purpose) in OPTIONAL_MODULES.items()
-        ]
+        modules = [pool.submit(_check_module, machine, *row) for row in libraries + extras]
         return [
             _check_python(machine),
             *_check_glibc(machine),
             *_check_libraries(machine),
-            *(future.result() for future in modules),
+            *(future.result() for future in modules[: len(libraries)]),
             open3d.result(),
             torch.result(),
-            *(future.result() for future in extras),
+            *(future.result() for future in modules[len(libraries) :]),
             _check_memory(machine),
             _check_display(machine),
         ]
@@ -186,15 +181,10 @@ def _check_python(machine: Machine) -> Finding:
     version = machine.python()
     text = ".".join(map(str, version))
     if version < (3, 10):
-        return Finding(
-            "python",
-            "broken",
-            True,
-            f"{text}, but 3.10 or newer is needed",
-            "PYTHON=python3.11 bash scripts/quickstart.sh",
-        )
+        mend = "PYTHON=python3.11 bash scripts/quickstart.sh"
+        return Finding("python", "broken", f"{text}, but 3.10 or newer is needed", mend)
     note = " (newer than 3.13, the newest one tried)" if version >= (3, 14) else ""
-    return Finding("python", "ok", True, f"{text}{note}, {machine.executable()}")
+    return Finding("python", "ok", f"{text}{note}, {machine.executable()}")
 
 
 def _check_glibc(machine: Machine) -> list[Finding]:
@@ -203,15 +193,12 @@ def _check_glibc(machine: Machine) -> list[Finding]:
     version, needed = machine.glibc(), ".".join(map(str, GLIBC))
     mend = "use Debian 12, Ubuntu 22.04, Fedora 36 or newer; the C library cannot be exchanged by itself"
     if version is None:
-        return [
-            Finding(
-                "glibc", "missing", True, f"this C library is not glibc; Open3D needs glibc {needed}", mend
-            )
-        ]
+        problem = f"this C library is not glibc; Open3D needs glibc {needed}"
+        return [Finding("glibc", "missing", problem, mend)]
     text = ".".join(map(str, version))
     if version < GLIBC:
-        return [Finding("glibc", "broken", True, f"{text}, but Open3D needs {needed} or newer", mend)]
-    return [Finding("glibc", "ok", True, text)]
+        return [Finding("glibc", "broken", f"{text}, but Open3D needs {needed} or newer", mend)]
+    return [Finding("glibc", "ok", text)]
 
 
 def _check_libraries(machine: Machine) -> list[Finding]:
@@ -220,9 +207,9 @@ def _check_libraries(machine: Machine) -> list[Finding]:
     missing = [library for library in SYSTEM_LIBRARIES if not machine.loads(library.soname)]
     mend = _install_system(machine, missing) if missing else None  # one command for all of them
     return [
-        Finding(library.soname, "missing", True, "not found; Open3D loads it", mend)
+        Finding(library.soname, "missing", "not found; Open3D loads it", mend)
         if library in missing
-        else Finding(library.soname, "ok", True, "found")
+        else Finding(library.soname, "ok", "found")
         for library in SYSTEM_LIBRARIES
     ]
 
@@ -231,21 +218,18 @@ def _check_open3d(machine: Machine) -> Finding:
     wheel = "open3d-cpu" if machine.system() == "linux" and machine.architecture() == "x86_64" else "open3d"
     versions = {name: machine.version(name) for name in ("open3d", "open3d-cpu")}
     present = {name: version for name, version in versions.items() if version is not None}
+    install = _pip(machine, f"install {wheel}")
     if len(present) == 2:
-        return Finding(
-            "open3d",
-            "broken",
-            True,
-            "open3d and open3d-cpu are both installed and overwrite each other's files",
-            _pip(machine, "uninstall -y open3d open3d-cpu") + " && " + _pip(machine, f"install {wheel}"),
-        )
+        problem = "open3d and open3d-cpu are both installed and overwrite each other's files"
+        mend = _pip(machine, "uninstall -y open3d open3d-cpu") + " && " + install
+        return Finding("open3d", "broken", problem, mend)
     outcome = machine.run_import("import open3d; print(open3d.__version__)")
     if outcome.ok:
         name, version = next(iter(present.items()), ("built from source", outcome.text))
-        return Finding("open3d", "ok", True, f"{version} ({name})")
+        return Finding("open3d", "ok", f"{version} ({name})")
     if not present:
-        return Finding("open3d", "missing", True, "not installed", _pip(machine, f"install {wheel}"))
-    return Finding("open3d", "broken", True, outcome.text, _mend_open3d(machine, outcome.text, *present))
+        return Finding("open3d", "missing", "not installed", install)
+    return Finding("open3d", "broken", outcome.text, _mend_open3d(machine, outcome.text, *present))
 
 
 def _mend_open3d(machine: Machine, complaint: str, installed: str) -> str:
@@ -267,63 +251,55 @@ def _mend_open3d(machine: Machine, complaint: str, installed: str) -> str:
 
 def _check_torch(machine: Machine) -> Finding:
     if machine.version("torch") is None:
-        return Finding("torch", "missing", True, "not installed", _pip(machine, f"install {TORCH}"))
+        return Finding("torch", "missing", "not installed", _pip(machine, f"install {TORCH}"))
     outcome = machine.run_import(
         "import torch; print(torch.__version__, torch.version.cuda or '-', torch.cuda.is_available(), "
         "torch.get_num_threads())"
     )
     fields = outcome.text.split()
     if not outcome.ok or len(fields) != 4:
-        return Finding(
-            "torch", "broken", True, outcome.text, _pip(machine, f"install --force-reinstall {TORCH}")
-        )
+        mend = _pip(machine, f"install --force-reinstall {TORCH}")
+        return Finding("torch", "broken", outcome.text, mend)
     version, cuda, available, threads = fields
     build = "CPU build" if cuda == "-" else f"CUDA {cuda} build"
     device = "GPU usable" if available == "True" else "no GPU usable"
-    return Finding("torch", "ok", True, f"{version}, {build}, {device}, {threads} threads")
+    return Finding("torch", "ok", f"{version}, {build}, {device}, {threads} threads")
 
 
-def _check_module(machine: Machine, module: str, requirement: str, required: bool, purpose: str) -> Finding:
+def _check_module(machine: Machine, module: str, requirement: str, purpose: str = "") -> Finding:
+    """A library; with a purpose it is an optional one."""
     name = requirement.split(">=")[0].split("[")[0]  # as pip calls it
-    install = f"install '{requirement}'"  # quoted: a shell takes > and [] for its own
-    note = f", for {purpose}" if purpose else ""
+    note, required = (f", for {purpose}", False) if purpose else ("", True)
     outcome = machine.run_import(f"import {module}")
     if outcome.ok:
-        return Finding(name, "ok", required, (machine.version(name) or "found") + note)
+        return Finding(name, "ok", (machine.version(name) or "found") + note, required=required)
+    # The requirement is quoted: a shell takes > and [ for its own.
     if f"No module named '{module.split('.')[0]}'" in outcome.text:
-        return Finding(name, "missing", required, "not installed" + note, _pip(machine, install))
-    mend = _pip(machine, install.replace("install", "install --force-reinstall", 1))
-    return Finding(name, "broken", required, outcome.text, mend)
+        mend = _pip(machine, f"install '{requirement}'")
+        return Finding(name, "missing", "not installed" + note, mend, required)
+    mend = _pip(machine, f"install --force-reinstall '{requirement}'")
+    return Finding(name, "broken", outcome.text, mend, required)
 
 
 def _check_memory(machine: Machine) -> Finding:
     memory = machine.memory()
     if memory is None:
-        return Finding("memory", "ok", False, "this system does not say")
+        return Finding("memory", "ok", "this system does not say", required=False)
     available, total = (amount // 2**20 for amount in memory)
     detail = f"{available:,} MiB available of {total:,} MiB"
     if available < 1024:
-        return Finding(
-            "memory",
-            "broken",
-            False,
-            detail + ", little",
-            "close other programs, or use a larger --voxel-size",
-        )
-    return Finding("memory", "ok", False, detail)
+        mend = "close other programs, or use a larger --voxel-size"
+        return Finding("memory", "broken", detail + ", little", mend, required=False)
+    return Finding("memory", "ok", detail, required=False)
 
 
 def _check_display(machine: Machine) -> Finding:
     display = machine.display()
     if display is not None:
-        return Finding("display", "ok", False, display)
-    return Finding(
-        "display",
-        "missing",
-        False,
-        "no screen; only `register --show` needs one",
-        "use --picture or --page instead of --show, or set DISPLAY (over a network: ssh -X)",
-    )
+        return Finding("display", "ok", display, required=False)
+    problem = "no screen; only `register --show` needs one"
+    mend = "use --picture or --page instead of --show, or set DISPLAY (over a network: ssh -X)"
+    return Finding("display", "missing", problem, mend, required=False)
 
 
 def _main(arguments: list[str]) -> int:

@@ -6,6 +6,8 @@ from a folder of models where one is given.
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from geomoe3d.data.rooms import seats, storage
@@ -41,60 +43,32 @@ MAKERS: dict[str, Maker] = {
 }
 
 # Piece, least and most of it. Earlier ones get the better places.
-PROGRAMS: dict[str, list[tuple[str, int, int]]] = {
-    "living": [
-        ("sofa", 1, 3),
-        ("bookshelf", 0, 3),
-        ("chest", 1, 3),
-        ("table", 0, 2),
-        ("lamp", 0, 2),
-        ("plant", 0, 3),
-        ("wall shelf", 0, 2),
-        ("picture", 1, 6),
-        ("boxes", 0, 2),
-    ],
-    "bedroom": [
-        ("bed", 1, 2),
-        ("wardrobe", 1, 2),
-        ("chest", 1, 3),
-        ("desk", 0, 1),
-        ("chair", 0, 2),
-        ("lamp", 0, 1),
-        ("picture", 0, 4),
-        ("wall shelf", 0, 2),
-        ("boxes", 0, 3),
-    ],
-    "kitchen": [
-        ("counter", 1, 3),
-        ("fridge", 1, 2),
-        ("table", 1, 1),
-        ("wall shelf", 0, 2),
-        ("chest", 0, 1),
-        ("picture", 0, 3),
-        ("boxes", 0, 2),
-    ],
-    "office": [
-        ("desk", 2, 5),
-        ("bookshelf", 1, 4),
-        ("chest", 0, 3),
-        ("table", 0, 1),
-        ("wardrobe", 0, 2),
-        ("wall shelf", 0, 3),
-        ("picture", 0, 4),
-        ("plant", 0, 2),
-        ("boxes", 0, 4),
-    ],
-    "bathroom": [
-        ("bathtub", 0, 1),
-        ("toilet", 1, 1),
-        ("washbasin", 1, 2),
-        ("chest", 0, 2),
-        ("picture", 0, 1),
-        ("boxes", 0, 2),
-    ],
-    "meeting": [("table", 1, 3), ("chair", 2, 6), ("bookshelf", 0, 2), ("picture", 1, 3), ("plant", 0, 2)],
-    "store": [("bookshelf", 2, 5), ("boxes", 3, 9), ("table", 0, 2), ("wardrobe", 0, 2), ("chest", 0, 2)],
+_PROGRAMS = {
+    "living": (
+        "sofa 1-3, bookshelf 0-3, chest 1-3, table 0-2, lamp 0-2, plant 0-3, wall shelf 0-2, picture 1-6, "
+        "boxes 0-2"
+    ),
+    "bedroom": (
+        "bed 1-2, wardrobe 1-2, chest 1-3, desk 0-1, chair 0-2, lamp 0-1, picture 0-4, wall shelf 0-2, "
+        "boxes 0-3"
+    ),
+    "kitchen": "counter 1-3, fridge 1-2, table 1-1, wall shelf 0-2, chest 0-1, picture 0-3, boxes 0-2",
+    "office": (
+        "desk 2-5, bookshelf 1-4, chest 0-3, table 0-1, wardrobe 0-2, wall shelf 0-3, picture 0-4, "
+        "plant 0-2, boxes 0-4"
+    ),
+    "bathroom": "bathtub 0-1, toilet 1-1, washbasin 1-2, chest 0-2, picture 0-1, boxes 0-2",
+    "meeting": "table 1-3, chair 2-6, bookshelf 0-2, picture 1-3, plant 0-2",
+    "store": "bookshelf 2-5, boxes 3-9, table 0-2, wardrobe 0-2, chest 0-2",
 }
+PROGRAMS: dict[str, list[tuple[str, int, int]]] = {
+    kind: [
+        (name, int(least), int(most))
+        for name, least, most in re.findall(r"([a-z ]+) (\d+)-(\d+)", text.replace(", ", ","))
+    ]
+    for kind, text in _PROGRAMS.items()
+}
+"""Kind of room -> pieces, least and most of each."""
 _WEIGHTS = {"living": 4, "bedroom": 3, "kitchen": 4, "office": 5, "bathroom": 1, "meeting": 2, "store": 1}
 
 

@@ -224,7 +224,7 @@ def copied(finished, tmp_path):
         ({"workers": 1000}, InputError, "1000 workers would take"),
         ({"workers": 1, "scheduler": "tcp://127.0.0.1:1"}, InputError, "either workers or a scheduler"),
         ({"scheduler": "tcp://127.0.0.1:1"}, DependencyError, "needs Dask"),
-        ({"cache": __file__}, OutputError, "is a file; described clouds are kept in a folder"),
+        ({"cache": __file__}, OutputError, "is a file; the cache of features is a folder"),
         ({"cache": f"{__file__}/deeper"}, OutputError, "is a file"),
         ({"config": ["filter.name=nothing"]}, ConfigError, "unknown filter"),
         ({"config": ["filter.name=geomoe", "filter.weights=nowhere"]}, CheckpointError, "nowhere"),
@@ -386,7 +386,7 @@ def test_a_cache_that_is_a_file_is_refused(scans, finished, tmp_path):
     for options, named in zip((("--cache", broken), ()), environments, strict=True):
         done = run_cli(*arguments, *options, check=2, **named)
         assert done.stderr == (
-            f"error: '{broken}' is a file; described clouds are kept in a folder: give one, or none\n"
+            f"error: '{broken}' is a file; the cache of features is a folder: give one, or none\n"
         )
     assert not (tmp_path / "o").exists()
 

@@ -262,7 +262,7 @@ def copied(model, tmp_path):
         ({"workers": 1000}, InputError, "1000 workers would take"),
         ({"workers": 1, "scheduler": "tcp://127.0.0.1:1"}, InputError, "either workers or a scheduler"),
         ({"scheduler": "tcp://127.0.0.1:1"}, DependencyError, "needs Dask"),
-        ({"cache": __file__}, OutputError, "is a file; described clouds are kept in a folder"),
+        ({"cache": __file__}, OutputError, "is a file; the cache of features is a folder"),
         ({"config": load_config(None, [*SETTINGS, "filter.name=nothing"])}, ConfigError, "unknown filter"),
         ({"scans": ["scan_0.npy", "scan_9.ply"]}, InputError, "fewer than 2 scans can be used"),
     ],
@@ -313,7 +313,7 @@ def test_the_cache_of_the_command_must_be_a_folder(scanned_room, tmp_path):
         cwd=Path(__file__).parents[1],
     )
     assert done.returncode == 2
-    assert done.stderr.startswith(f"error: '{scans / 'scan_9.ply'}' is a file; described clouds are kept in")
+    assert done.stderr.startswith(f"error: '{scans / 'scan_9.ply'}' is a file; the cache of features is a")
     assert not (tmp_path / "o").exists()
 
 

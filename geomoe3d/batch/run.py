@@ -86,7 +86,7 @@ class Labour:
         if cache is None and self.scheduler is None:  # the workers of a cluster have their own
             cache = os.environ.get(CACHE_VARIABLE)
         if cache:
-            check_can_be_folder(Path(cache), "described clouds are kept in a folder: give one, or none")
+            check_can_be_folder(Path(cache), "the cache of features is a folder: give one, or none")
 
     def pool(self, each: int, say: Callable[[str], None]) -> Pool:
         """Where to run, after saying how much memory it takes.

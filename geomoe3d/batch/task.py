@@ -116,5 +116,5 @@ def open_cache(folder: str | None) -> DescriptionCache | None:
     try:
         return DescriptionCache(folder or default_cache_folder())
     except OutputError as error:
-        warnings.warn(f"described clouds are not kept: {error}", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"features are not cached: {error}", RuntimeWarning, stacklevel=2)
         return None

@@ -34,8 +34,8 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.option("--page", is_flag=True, help="Write OUT/page.html with a picture of every pair.")
 @click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier batch.")
 @click.option("--retry", is_flag=True, help="Try pairs again that could not be registered.")
-@click.option("--cache", metavar="FOLDER", help="Where described clouds are kept. [the user's cache folder]")
-@click.option("--no-cache", is_flag=True, help="Describe every cloud anew for every pair.")
+@click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
+@click.option("--no-cache", is_flag=True, help="Cache no features: compute them anew for every pair.")
 @click.option("--quiet", is_flag=True, help="No progress and no table.")
 @traceback_option
 @click.pass_context

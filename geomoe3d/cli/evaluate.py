@@ -47,7 +47,7 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 metavar="NAME",
                 default="clouds",
                 show_default=True,
-                help="1k or all: fixed correspondences; clouds: end to end.",
+                help="Input: 1k or all (fixed correspondences), or clouds (end to end).",
             ),
             click.option("--every", default=1, show_default=True, help="Every n-th pair only."),
             click.option(
@@ -64,16 +64,16 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 multiple=True,
                 help="Configuration of the method geomoe3d; repeatable.",
             ),
-            click.option("--label", help="What to call the run, where there is one method. [its name]"),
+            click.option("--label", help="Name of the run, if there is one method. [the method's]"),
             click.option("--data", "root", metavar="FOLDER", help="Of the benchmarks. [GEOMOE3D_DATA]"),
             click.option(
                 "--workers",
                 default=1,
                 show_default=True,
-                help="Processes over pairs; two or more outlive a method that crashes.",
+                help="Processes; with two or more, a method that crashes loses one pair only.",
             ),
             click.option("--seed", default=0, show_default=True, help="Same seed, same predictions."),
-            click.option("--fresh", is_flag=True, help="Remove what these runs hold and predict again."),
+            click.option("--fresh", is_flag=True, help="Remove the stored answers of these runs first."),
         )
     ):
         function = option(function)
@@ -84,10 +84,10 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
 @_prediction_options
 @traceback_option
 def predict(**given: Any) -> None:
-    """Let methods register the pairs of benchmarks and keep what they say in OUT.
+    """Run methods on the pairs of benchmarks and store their answers in the folder OUT.
 
-    Every method sees each pair in turn, on the same input. A run that was interrupted goes on; predictions
-    of other settings, code or input are refused, never mixed.
+    All methods register each pair in turn, from the same input. An interrupted run is continued; answers of
+    other settings, code or input are refused, never mixed.
     """
     _predict(**given)
 
@@ -110,7 +110,7 @@ def run(**given: Any) -> None:
 
 @command.command(context_settings=HELP)
 @click.argument("study", metavar="OUT", type=click.Path(file_okay=False))
-@click.option("--raw", is_flag=True, help="Rotations of the truth as published, not projected onto SO(3).")
+@click.option("--raw", is_flag=True, help="Use the true rotations as published, not projected onto SO(3).")
 @click.option(
     "--report",
     "reports",
@@ -143,7 +143,7 @@ def score(study: str, raw: bool, reports: tuple[str, ...], force: bool, quiet: b
 @click.argument("second", metavar="RUN", type=click.Path(file_okay=False))
 @traceback_option
 def compare(first: str, second: str) -> None:
-    """Compare two runs pair by pair: who is right where, McNemar's test, ratio of the times."""
+    """Compare two runs pair by pair: pairs that only one gets right, McNemar's test, ratio of the times."""
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.compare import compare as compare_scores
     from geomoe3d.evaluation.report_text import terminal_comparison
@@ -159,7 +159,7 @@ def compare(first: str, second: str) -> None:
 @command.command(context_settings=HELP)
 @traceback_option
 def methods() -> None:
-    """List the methods, what each can be given, and which are not installed."""
+    """List the methods, the inputs each accepts, and what is not installed."""
     from geomoe3d.evaluation.methods import make_method, method_names
 
     for name in method_names():

@@ -54,7 +54,7 @@ _SHOWN = 20
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
 @click.option("--no-page", is_flag=True, help="Do not write OUT/page.html.")
 @click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier model.")
-@click.option("--cache", metavar="FOLDER", help="Where described clouds are kept. [the user's cache folder]")
+@click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @traceback_option
 @click.pass_context

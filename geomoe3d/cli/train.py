@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.argument("assignments", nargs=-1, metavar="[KEY=VALUE]...")
 @click.option("--out", type=click.Path(), help="Run folder (default: runs/ and the name of CONFIG).")
 @click.option("--fresh", is_flag=True, help="Refuse to go on with a run that is there.")
-@click.option("--overfit", is_flag=True, help="Only learn one batch by heart; writes nothing.")
+@click.option("--overfit", is_flag=True, help="Overfit one batch (sanity check); writes nothing.")
 @click.option("--show", is_flag=True, help="Print the complete configuration and stop.")
 @click.option("--quiet", is_flag=True, help="Print nothing but the summary.")
 @traceback_option

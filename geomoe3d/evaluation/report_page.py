@@ -270,7 +270,7 @@ def make_card(
     motions = {"estimate": estimate if has_motion(estimate) else None, "truth": pair.T_target_source}
     clouds, problem = None, ""
     if all(T is None for T in motions.values()):
-        problem = "There is neither an answer nor a true motion to show."
+        problem = "There is neither an answer nor a true transform to show."
     else:
         try:
             clouds = _clouds(pair, motions, max_points)
@@ -330,14 +330,12 @@ def _gallery_words(score: RunScore, shown: int) -> str:
     name = f"'{score.info.label}', track {score.info.track}"
     if is_unrelated(score):
         if all(pair.status is None for pair in score.pairs):
-            return (
-                f"Run {name} does not say of which answers it is sure, so it accepts none and refuses none."
-            )
+            return f"Run {name} states no status, so it accepts and refuses no pair."
         count = sum(pair.status == "ok" for pair in score.pairs)
         if not count:
-            return f"Run {name} called none of {len(score.pairs):,} unrelated pairs ok."
+            return f"Run {name} accepted none of {len(score.pairs):,} unrelated pairs."
         return (
-            f"Run {name} called {count:,} of {len(score.pairs):,} pairs ok whose scans have nothing in "
+            f"Run {name} accepted {count:,} of {len(score.pairs):,} pairs whose scans have nothing in "
             f"common; shown: the {shown:,} most confident."
         )
     count = sum(not pair.right for pair in score.pairs)

@@ -22,17 +22,17 @@ COLUMNS = {
     "rmse_recall": "RMSE\nrecall",
     "rotation_median": "rotation\ndeg",
     "translation_median": "transl.\ncm",
-    "verified_f1": "F1 by\nmotion",
-    "accepted": "called\nok",
-    "accepted_right": "right\nof ok",
+    "verified_f1": "F1 by\ntransform",
+    "accepted": "accepted\n%",
+    "accepted_right": "precision\nof ok",
     "time_median": "median\nms",
 }
 """Measures of the main table and their headings."""
 LEGEND = (
     "recall: % of pairs below 15 (20) deg and 0.30 m, mean over pairs with its 95 % interval; scene mean: "
     "mean over scenes of the former; RMSE recall: at most 0.20 m, pairs not consecutive; rotation, "
-    "translation: medians over right pairs; F1: inliers by the motion, mean over pairs, %; called ok: % of "
-    "pairs; right of ok: % of those; -: not defined."
+    "translation: medians over right pairs; F1: inliers by the transform, mean over pairs, %; accepted: % of "
+    "pairs with status ok; precision: % of those that are right; -: not defined."
 )
 _LONGEST_ERROR = 300
 
@@ -307,7 +307,7 @@ def benchmark_tables(scores: Sequence[RunScore]) -> str:
             rows = [
                 [_plain(run.info.label), value_and_interval(run.measures.get("accepted"))] for run in ranked
             ]
-            lines += _table(["run", "called ok, %"], rows)
+            lines += _table(["run", "accepted, %"], rows)
         else:
             lines += _main_lines({_plain(run.info.label): run for run in ranked})
     lines += [LEGEND[0].upper() + LEGEND[1:], ""]
@@ -322,7 +322,7 @@ def benchmark_tables(scores: Sequence[RunScore]) -> str:
     ]
     if rows:
         lines += ["### Confidence", ""]
-        lines += _table(["run", "benchmark", "AUROC of success", "calibration error", "called ok, %"], rows)
+        lines += _table(["run", "benchmark", "AUROC of success", "calibration error", "accepted, %"], rows)
     said = (
         [f"Commit {run.info.commit or 'unknown'}" for run in scores],
         [run.info.hardware for run in scores],

@@ -185,7 +185,7 @@ def _drawn(view: RegistrationView, drawing: Drawing) -> str:
     if drawing.apart is not None:
         text += (
             f" In their files the clouds lie {drawing.apart:,.6g} units apart, too far to be drawn:"
-            " before lays the source beside the target."
+            " before draws the source beside the target."
         )
     if view.has_transform:
         text += " Between before and after the source turns about its own middle; it stays rigid."

@@ -48,7 +48,7 @@ def draw_correspondences(axes: Axes, view: RegistrationView, drawing: Drawing, f
     frame(axes)
     axes.set_title("Correspondences", loc="left", fontsize=13, fontweight="bold", color=INK, pad=8)
     if len(view.correspondences) and drawing.after is not None:
-        note = "source laid beside target: right ones run level"
+        note = "source drawn beside target: correct ones are level"
         axes.set_title(note, loc="right", fontsize=10, color=SOFT, pad=8)
     motion = drawing.before if drawing.after is None else drawing.after
     source = transform_points(motion, drawing.source) @ drawing.axes.T

@@ -15,7 +15,7 @@ from geomoe3d.data.rooms.clutter import litter, put_things
 from geomoe3d.data.rooms.models import ModelLibrary
 from geomoe3d.data.rooms.pieces import Maker, Piece
 from geomoe3d.data.rooms.shell import SIDES, Rect, Room, overlaps
-from geomoe3d.data.rooms.solids import Solids, pose_on_floor
+from geomoe3d.data.rooms.solids import Solids, between, pose_on_floor
 from geomoe3d.types import FloatArray
 
 MAKERS: dict[str, Maker] = {
@@ -140,19 +140,14 @@ class _Decorator:
             low, high = room.wall(side)
             if high - low < piece.width + 0.02:
                 continue
-            at = float(rng.uniform(low + piece.width / 2, high - piece.width / 2))
-            gap = 0.0 if piece.hangs else float(rng.uniform(0.0, 0.06))
+            at = between(rng, low + piece.width / 2, high - piece.width / 2)
+            gap = 0.0 if piece.hangs else between(rng, 0.0, 0.06)
             if piece.height > 0.9 and not piece.hangs and self._covers_window(side, at, piece):
                 continue
             if piece.hangs and self._covers_window(side, at, piece):
                 continue
-            x0, y0, x1, y1 = room.rect
-            x, y, angle = {
-                "south": (at, y0 + gap, 0.0),
-                "north": (at, y1 - gap, 180.0),
-                "west": (x0 + gap, at, -90.0),
-                "east": (x1 - gap, at, 90.0),
-            }[side]
+            x, y = room.place(side, at, gap)
+            angle = {"south": 0.0, "north": 180.0, "west": -90.0, "east": 90.0}[side]
             T = self._try(piece, x, y, angle + float(rng.normal(0, 1.0)) * (not piece.hangs))
             if T is not None:
                 return T
@@ -165,7 +160,7 @@ class _Decorator:
     def _in_the_room(self, piece: Piece) -> FloatArray | None:
         x0, y0, x1, y1 = self.room.rect
         for _ in range(12):
-            x, y = float(self.rng.uniform(x0 + 0.4, x1 - 0.4)), float(self.rng.uniform(y0 + 0.4, y1 - 0.4))
+            x, y = between(self.rng, x0 + 0.4, x1 - 0.4), between(self.rng, y0 + 0.4, y1 - 0.4)
             angle = float(self.rng.choice([0.0, 90.0, 180.0, 270.0]) + self.rng.normal(0, 8))
             T = self._try(piece, x, y, angle)
             if T is not None:
@@ -194,8 +189,8 @@ class _Decorator:
         for k in range(int(self.rng.integers(0, 7))):
             # Seats of one table are often alike: the repeated structure that misleads a matcher.
             seat = same if self.rng.random() < 0.8 else self.make("chair")
-            side, share = (1 if k % 2 else -1), float(self.rng.uniform(-0.4, 0.4))
-            tucked = float(self.rng.uniform(-0.25, 0.15))
+            side, share = (1 if k % 2 else -1), between(self.rng, -0.4, 0.4)
+            tucked = between(self.rng, -0.25, 0.15)
             local = pose_on_floor(
                 share * piece.width,
                 piece.depth / 2 + side * (piece.depth / 2 + seat.depth + tucked),
@@ -205,9 +200,9 @@ class _Decorator:
 
     def _before(self, piece: Piece, T: FloatArray, name: str, gap: float, turned: float) -> None:
         other = self.make(name)
-        reach = piece.depth + gap + (other.depth if turned else 0.0) * float(self.rng.uniform(0.4, 1.1))
+        reach = piece.depth + gap + (other.depth if turned else 0.0) * between(self.rng, 0.4, 1.1)
         angle = turned + float(self.rng.normal(0, 25 if turned else 4))
-        x = float(self.rng.uniform(-0.2, 0.2)) * piece.width
+        x = between(self.rng, -0.2, 0.2) * piece.width
         self._force(other, T @ pose_on_floor(x, reach, angle), allowed=_footprint(piece, T))
 
     def _beside(self, piece: Piece, T: FloatArray) -> None:

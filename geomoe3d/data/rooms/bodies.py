@@ -15,7 +15,7 @@ import numpy as np
 from geomoe3d.data.rooms.arrange import MAKERS
 from geomoe3d.data.rooms.clutter import thing
 from geomoe3d.data.rooms.models import ModelLibrary
-from geomoe3d.data.rooms.solids import Solids, frame_along
+from geomoe3d.data.rooms.solids import Solids, between, frame_along
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray
 
@@ -102,13 +102,13 @@ def _pile(rng: np.random.Generator, library: ModelLibrary | None) -> Solids:
 def _grown(rng: np.random.Generator) -> Solids:
     solids = Solids()
     joints: list[tuple[FloatArray, float]] = [(np.zeros(3), 0.5)]
-    solids.blob((0, 0, 0), _triple(rng.uniform(0.25, 0.6, 3)), rng, float(rng.uniform(0, 0.5)))
+    solids.blob((0, 0, 0), _triple(rng.uniform(0.25, 0.6, 3)), rng, between(rng, 0, 0.5))
     for _ in range(int(rng.integers(4, 14))):
         at, size = joints[int(rng.integers(len(joints)))]
         direction = rng.normal(0, 1, 3)
         direction /= np.linalg.norm(direction)
         start = at + 0.7 * size * direction
-        size = max(size * float(rng.uniform(0.4, 0.9)), 0.08)
+        size = max(size * between(rng, 0.4, 0.9), 0.08)
         part, end = _limb(rng, size)
         solids.place(part, make_transform(frame_along(direction), start))
         joints.append((start + end * direction, size))
@@ -117,20 +117,20 @@ def _grown(rng: np.random.Generator) -> Solids:
 
 def _limb(rng: np.random.Generator, size: float) -> tuple[Solids, float]:
     """A part that begins at the origin and goes up, and where the next one may join it."""
-    part, length = Solids(), size * float(rng.uniform(0.8, 3.0))
+    part, length = Solids(), size * between(rng, 0.8, 3.0)
     kind = rng.random()
     if kind < 0.45:
         radii = (*(size * rng.uniform(0.3, 0.9, 2)), length / 2)
-        part.blob((0, 0, length / 2), _triple(np.array(radii)), rng, float(rng.uniform(0, 0.5)))
+        part.blob((0, 0, length / 2), _triple(np.array(radii)), rng, between(rng, 0, 0.5))
     elif kind < 0.7:
-        radius = size * float(rng.uniform(0.1, 0.5))
-        part.cylinder((0, 0, 0), radius, length, top_radius=radius * float(rng.uniform(0.1, 1.3)))
+        radius = size * between(rng, 0.1, 0.5)
+        part.cylinder((0, 0, 0), radius, length, top_radius=radius * between(rng, 0.1, 1.3))
     elif kind < 0.85:
         width, depth = (size * float(share) for share in rng.uniform(0.2, 1.4, 2))
         part.box((-width / 2, -depth / 2, 0), (width, depth, length))
     else:  # a bent rod
         bend = _triple(np.array([*rng.normal(0, 0.3 * length, 2), length / 2]))
-        radius = size * float(rng.uniform(0.1, 0.3))
+        radius = size * between(rng, 0.1, 0.3)
         part.rod((0, 0, 0), bend, radius)
         part.rod(bend, (0, 0, length), radius)
     return part, length

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from geomoe3d.data.rooms.solids import Solids, Triple
+from geomoe3d.data.rooms.solids import Solids, Triple, between
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def color(rng: np.random.Generator) -> Triple:
 
 def legs(s: Solids, rng: np.random.Generator, w: float, d: float, top: float, c: Triple) -> None:
     """Four legs under a rectangle of width w and depth d, up to ``top``."""
-    thick, inset = float(rng.uniform(0.02, 0.07)), float(rng.uniform(0.0, 0.08))
+    thick, inset = between(rng, 0.02, 0.07), between(rng, 0.0, 0.08)
     style = rng.integers(3)
     for sx in (-1, 1):
         for y in (inset, d - inset - thick):
@@ -87,7 +87,7 @@ def fronts(
     edges = np.linspace(low, high, rows + 1)
     knob = rng.random() < 0.5
     for z0, z1 in pairwise(edges):
-        out = float(rng.uniform(0.08, 0.25)) if rng.random() < 0.06 else 0.018
+        out = between(rng, 0.08, 0.25) if rng.random() < 0.06 else 0.018
         s.box((x + 0.008, y, z0 + 0.006), (width - 0.016, out, z1 - z0 - 0.012), c)
         z = float(z1 - 0.3 * (z1 - z0)) if z1 - z0 > 0.3 else float((z0 + z1) / 2)
         if knob:
@@ -100,19 +100,19 @@ def books(
     s: Solids, rng: np.random.Generator, x: tuple[float, float], y: float, depth: float, z: float, high: float
 ) -> None:
     """A row of books, leaning, lying and missing here and there."""
-    at = x[0] + float(rng.uniform(0, 0.05))
-    end = x[0] + (x[1] - x[0]) * float(rng.uniform(0.4, 1.0))
+    at = x[0] + between(rng, 0, 0.05)
+    end = x[0] + (x[1] - x[0]) * between(rng, 0.4, 1.0)
     while at < end:
-        thick = float(rng.uniform(0.012, 0.06))
-        tall, deep = high * float(rng.uniform(0.55, 0.97)), depth * float(rng.uniform(0.5, 0.98))
+        thick = between(rng, 0.012, 0.06)
+        tall, deep = high * between(rng, 0.55, 0.97), depth * between(rng, 0.5, 0.98)
         if at + thick > x[1]:
             break
         if rng.random() < 0.06:
-            pile = float(rng.uniform(0.15, 0.28))
+            pile = between(rng, 0.15, 0.28)
             if at + pile > x[1]:
                 break
             s.box((at, y, z), (pile, deep * 0.8, min(high, thick * 3)), color(rng))
             at += pile
             continue
         s.box((at, y, z), (thick, deep, tall), color(rng))
-        at += thick + (float(rng.uniform(0.02, 0.15)) if rng.random() < 0.12 else 0.001)
+        at += thick + (between(rng, 0.02, 0.15) if rng.random() < 0.12 else 0.001)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from geomoe3d.data.rooms.solids import Solids
+from geomoe3d.data.rooms.solids import Solids, between
 
 _WALL = 0.12  # thickness between two rooms, metres
 
@@ -56,23 +56,33 @@ class Room:
         x0, y0, x1, y1 = self.rect
         return (x0, x1) if side in ("south", "north") else (y0, y1)
 
+    def place(self, side: str, along: float, away: float) -> tuple[float, float]:
+        """Where on the floor a place is that is given along a wall and away from it."""
+        x0, y0, x1, y1 = self.rect
+        return {
+            "south": (along, y0 + away),
+            "north": (along, y1 - away),
+            "west": (x0 + away, along),
+            "east": (x1 - away, along),
+        }[side]
+
 
 def plan_flat(rng: np.random.Generator, num_rooms: int) -> list[Room]:
     """Rooms of a flat with doorways, windows and doors, before anything is built."""
-    area = num_rooms * float(rng.uniform(9.0, 26.0))
-    ratio = float(rng.uniform(0.6, 1.6))
+    area = num_rooms * between(rng, 9.0, 26.0)
+    ratio = between(rng, 0.6, 1.6)
     rects: list[Rect] = [(0.0, 0.0, float(np.sqrt(area * ratio)), float(np.sqrt(area / ratio)))]
     while len(rects) < num_rooms:
         rects.sort(key=lambda r: (r[2] - r[0]) * (r[3] - r[1]))
         x0, y0, x1, y1 = rects.pop()
-        cut = float(rng.uniform(0.38, 0.62))
+        cut = between(rng, 0.38, 0.62)
         if x1 - x0 > y1 - y0:
             middle = x0 + cut * (x1 - x0)
             rects += [(x0, y0, middle - _WALL / 2, y1), (middle + _WALL / 2, y0, x1, y1)]
         else:
             middle = y0 + cut * (y1 - y0)
             rects += [(x0, y0, x1, middle - _WALL / 2), (x0, middle + _WALL / 2, x1, y1)]
-    height = float(rng.uniform(2.3, 3.2))
+    height = between(rng, 2.3, 3.2)
     rooms = [Room(rect, height) for rect in rects]
     shared = join(rng, rooms)
     for room in rooms:
@@ -80,7 +90,7 @@ def plan_flat(rng: np.random.Generator, num_rooms: int) -> list[Room]:
             if (id(room), side) not in shared:
                 _outer_openings(rng, room, side)
         if rng.random() < 0.15:
-            room.low_side, room.low_height = str(rng.choice(SIDES)), float(rng.uniform(1.2, 1.9))
+            room.low_side, room.low_height = str(rng.choice(SIDES)), between(rng, 1.2, 1.9)
     return rooms
 
 
@@ -90,7 +100,7 @@ def build_shell(rng: np.random.Generator, solids: Solids, room: Room) -> None:
     pad = _WALL / 2
     solids.box((x0 - pad, y0 - pad, -0.1), (x1 - x0 + 2 * pad, y1 - y0 + 2 * pad, 0.1))
     _ceiling(rng, solids, room)
-    skirting = float(rng.uniform(0.05, 0.12)) if rng.random() < 0.7 else 0.0
+    skirting = between(rng, 0.05, 0.12) if rng.random() < 0.7 else 0.0
     for side in SIDES:
         _wall(solids, room, side, 0.0, room.height, -pad, pad)
         if skirting:
@@ -110,29 +120,20 @@ def along(
     reach: tuple[float, float],
 ) -> None:
     """A box given in a wall's own terms: along it, upwards, and from the wall's face into the room."""
-    x0, y0, x1, y1 = room.rect
     (a, b), (z0, z1), (near, far) = span, levels, reach
     if b - a <= 0 or z1 - z0 <= 0:
         return
-    if side == "south":
-        solids.box((a, y0 + near, z0), (b - a, far - near, z1 - z0))
-    elif side == "north":
-        solids.box((a, y1 - far, z0), (b - a, far - near, z1 - z0))
-    elif side == "west":
-        solids.box((x0 + near, a, z0), (far - near, b - a, z1 - z0))
-    else:
-        solids.box((x1 - far, a, z0), (far - near, b - a, z1 - z0))
+    x, y = room.place(side, a, near if side in ("south", "west") else far)
+    size = (b - a, far - near) if side in ("south", "north") else (far - near, b - a)
+    solids.box((x, y, z0), (*size, z1 - z0))
 
 
 def strip(room: Room, side: str, start: float, end: float, depth: float) -> Rect:
     """The floor in front of a piece of wall."""
-    x0, y0, x1, y1 = room.rect
-    return {
-        "south": (start, y0, end, y0 + depth),
-        "north": (start, y1 - depth, end, y1),
-        "west": (x0, start, x0 + depth, end),
-        "east": (x1 - depth, start, x1, end),
-    }[side]
+    first, second = room.place(side, start, 0.0), room.place(side, end, depth)
+    if side in ("north", "east"):  # seen from there, the room lies towards zero
+        first, second = room.place(side, start, depth), room.place(side, end, 0.0)
+    return (*first, *second)
 
 
 def join(rng: np.random.Generator, rooms: list[Room]) -> set[tuple[int, str]]:
@@ -149,11 +150,11 @@ def join(rng: np.random.Generator, rooms: list[Room]) -> set[tuple[int, str]]:
                 shared |= {(id(first), side), (id(second), other)}
                 if high - low < 1.3:
                     continue
-                width = float(rng.uniform(0.8, 1.0)) if rng.random() < 0.75 else float(rng.uniform(1.1, 2.0))
+                width = between(rng, 0.8, 1.0) if rng.random() < 0.75 else between(rng, 1.1, 2.0)
                 width = min(width, high - low - 0.2)
                 # The least place and the most can be one, and rounding turns them round.
-                start = float(rng.uniform(low + 0.1, max(high - 0.1 - width, low + 0.1)))
-                top = float(rng.uniform(1.98, 2.1))
+                start = between(rng, low + 0.1, max(high - 0.1 - width, low + 0.1))
+                top = between(rng, 1.98, 2.1)
                 for room, where, leaf in ((first, side, rng.random() < 0.5), (second, other, False)):
                     kind = "door ajar" if leaf and width < 1.05 else "passage"
                     room.openings[where].append(Opening(start, start + width, 0.0, top, kind))
@@ -163,19 +164,19 @@ def join(rng: np.random.Generator, rooms: list[Room]) -> set[tuple[int, str]]:
 
 def _outer_openings(rng: np.random.Generator, room: Room, side: str) -> None:
     low, high = room.wall(side)
-    at = low + float(rng.uniform(0.2, 0.8))
+    at = low + between(rng, 0.2, 0.8)
     while at < high - 0.9 and rng.random() < 0.75:
         if rng.random() < 0.65:
-            width, bottom = float(rng.uniform(0.7, 2.2)), float(rng.choice([0.1, 0.5, 0.85, 1.0]))
+            width, bottom = between(rng, 0.7, 2.2), float(rng.choice([0.1, 0.5, 0.85, 1.0]))
             width = min(width, high - 0.15 - at)
-            top = min(room.height - 0.1, bottom + float(rng.uniform(1.0, 1.6)))
+            top = min(room.height - 0.1, bottom + between(rng, 1.0, 1.6))
             kind = str(rng.choice(["window", "window", "blind"]))
             room.openings[side].append(Opening(at, at + width, bottom, top, kind))
         else:
-            width = min(float(rng.uniform(0.75, 0.95)), high - 0.1 - at)
+            width = min(between(rng, 0.75, 0.95), high - 0.1 - at)
             room.openings[side].append(Opening(at, at + width, 0.0, 2.03, "door shut"))
             room.taken.append(strip(room, side, at, at + width, 0.8))
-        at += width + float(rng.uniform(0.3, 2.0))
+        at += width + between(rng, 0.3, 2.0)
 
 
 def _wall(solids: Solids, room: Room, side: str, bottom: float, top: float, near: float, far: float) -> None:
@@ -195,8 +196,8 @@ def _wall(solids: Solids, room: Room, side: str, bottom: float, top: float, near
 def _fill(rng: np.random.Generator, solids: Solids, room: Room, side: str, hole: Opening) -> None:
     """Frames, panes, leaves, sills, radiators and curtains."""
     a, b, z0, z1 = hole.start, hole.end, hole.bottom, hole.top
-    frame = float(rng.uniform(0.04, 0.09))
-    out = float(rng.uniform(0.0, 0.03))
+    frame = between(rng, 0.04, 0.09)
+    out = between(rng, 0.0, 0.03)
     for span, levels in (
         ((a - frame, a), (z0, z1)),
         ((b, b + frame), (z0, z1)),
@@ -213,17 +214,17 @@ def _fill(rng: np.random.Generator, solids: Solids, room: Room, side: str, hole:
     elif hole.kind == "door ajar":
         _leaf(rng, solids, room, side, hole)
     elif hole.kind in ("window", "blind"):
-        recess = -float(rng.uniform(0.03, _WALL / 2))
-        panes = max(1, round((b - a) / float(rng.uniform(0.5, 0.9))))
+        recess = -between(rng, 0.03, _WALL / 2)
+        panes = max(1, round((b - a) / between(rng, 0.5, 0.9)))
         for k in range(panes + 1):
             at = a + (b - a) * k / panes
             along(solids, room, side, (at - 0.03, at + 0.03), (z0, z1), (recess - 0.03, recess + 0.03))
         for level in ((z0, z0 + 0.06), (z1 - 0.06, z1)):
             along(solids, room, side, (a, b), level, (recess - 0.03, recess + 0.03))
         if hole.kind == "blind" or rng.random() < 0.4:
-            bottom = z0 + float(rng.uniform(0, 0.7)) * (z1 - z0)
+            bottom = z0 + between(rng, 0, 0.7) * (z1 - z0)
             along(solids, room, side, (a, b), (bottom, z1), (recess + 0.02, recess + 0.04))
-        sill = float(rng.uniform(0.02, 0.25))
+        sill = between(rng, 0.02, 0.25)
         along(solids, room, side, (a - 0.05, b + 0.05), (z0 - 0.04, z0), (-_WALL / 2, sill))
         if z0 > 0.7 and rng.random() < 0.6:
             ribs = np.arange(a + 0.05, b - 0.1, 0.09)
@@ -242,14 +243,8 @@ def _curtain(
     low, high = room.wall(side)
     at = max(span[0], low + 0.05)
     while at < min(span[1], high - 0.05):
-        r = float(rng.uniform(0.02, 0.05))
-        x0, y0, x1, y1 = room.rect
-        x, y = {
-            "south": (at, y0 + 0.09),
-            "north": (at, y1 - 0.09),
-            "west": (x0 + 0.09, at),
-            "east": (x1 - 0.09, at),
-        }[side]
+        r = between(rng, 0.02, 0.05)
+        x, y = room.place(side, at, 0.09)
         solids.cylinder((x, y, bottom), r, min(top, room.height) - bottom, top_radius=r * 0.7)
         at += 1.5 * r
 
@@ -257,7 +252,7 @@ def _curtain(
 def _leaf(rng: np.random.Generator, solids: Solids, room: Room, side: str, hole: Opening) -> None:
     """A door leaf that stands open into the room."""
     x0, y0, x1, y1 = room.rect
-    width, angle = hole.end - hole.start, float(rng.uniform(60, 110))
+    width, angle = hole.end - hole.start, between(rng, 60, 110)
     hinge, base = {
         "south": ((hole.start, y0), 0.0),
         "north": ((hole.end, y1), 180.0),
@@ -273,7 +268,7 @@ def _ceiling(rng: np.random.Generator, solids: Solids, room: Room) -> None:
     h = room.height
     solids.box((x0 - 0.05, y0 - 0.05, h), (x1 - x0 + 0.1, y1 - y0 + 0.1, 0.05))
     if room.low_side is not None:
-        reach = float(rng.uniform(0.35, 0.7))
+        reach = between(rng, 0.35, 0.7)
         a, b = room.low_height, h
         sx, sy = x1 - x0, y1 - y0
         corners = {
@@ -284,11 +279,11 @@ def _ceiling(rng: np.random.Generator, solids: Solids, room: Room) -> None:
         }[room.low_side]
         solids.triangles(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
     if rng.random() < 0.15:
-        for x in np.arange(x0 + 0.4, x1 - 0.2, float(rng.uniform(0.6, 1.2))):
+        for x in np.arange(x0 + 0.4, x1 - 0.2, between(rng, 0.6, 1.2)):
             solids.box((float(x), y0, h - 0.18), (0.14, y1 - y0, 0.18))
     for _ in range(int(rng.integers(0, 3))):
-        x, y = float(rng.uniform(x0 + 0.5, x1 - 0.5)), float(rng.uniform(y0 + 0.5, y1 - 0.5))
-        drop, r = float(rng.uniform(0.1, 0.7)), float(rng.uniform(0.1, 0.3))
+        x, y = between(rng, x0 + 0.5, x1 - 0.5), between(rng, y0 + 0.5, y1 - 0.5)
+        drop, r = between(rng, 0.1, 0.7), between(rng, 0.1, 0.3)
         solids.rod((x, y, h), (x, y, h - drop), 0.008)
         solids.cylinder((x, y, h - drop - 0.15), r, 0.16, top_radius=r * 0.4)
 
@@ -297,7 +292,7 @@ def _breast(rng: np.random.Generator, solids: Solids, room: Room) -> None:
     """A chimney breast, pillar, pipe or duct that breaks a wall."""
     side = str(rng.choice(SIDES))
     low, high = room.wall(side)
-    width, depth = float(rng.uniform(0.15, 1.2)), float(rng.uniform(0.08, 0.5))
+    width, depth = between(rng, 0.15, 1.2), between(rng, 0.08, 0.5)
     start = float(rng.choice([low, high - width, rng.uniform(low, max(high - width, low + 0.01))]))
     rect = strip(room, side, start, start + width, depth)
     if any(overlaps(rect, other, 0.05) for other in room.taken):

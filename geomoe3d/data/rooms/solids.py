@@ -145,6 +145,11 @@ class Solids:
         self.triangles(scaled + np.asarray(corner), faces, color)
 
 
+def between(rng: np.random.Generator, low: float, high: float) -> float:
+    """A number drawn evenly between two."""
+    return float(rng.uniform(low, high))
+
+
 def frame_along(z: FloatArray) -> FloatArray:
     """(3, 3) rotation that turns the vertical into the unit vector z (3,)."""
     x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.data.rooms.pieces import Piece, Shelf, books, color, fronts, legs
-from geomoe3d.data.rooms.solids import Solids
+from geomoe3d.data.rooms.solids import Solids, between
 
 
 def wardrobe(rng: np.random.Generator) -> Piece:
     """A tall cupboard with doors and handles."""
     s, c = Solids(), color(rng)
     n = int(rng.integers(1, 4))
-    w, d, h = n * float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.4, 0.65)), float(rng.uniform(1.6, 2.3))
+    w, d, h = n * between(rng, 0.4, 0.6), between(rng, 0.4, 0.65), between(rng, 1.6, 2.3)
     s.box((-w / 2, 0, 0), (w, d, h), c)
     for k in range(n):
         x = -w / 2 + k * w / n
@@ -27,9 +27,9 @@ def chest(rng: np.random.Generator) -> Piece:
     s, c = Solids(), color(rng)
     n = int(rng.integers(1, 4))
     w, d, h = (
-        n * float(rng.uniform(0.38, 0.6)),
-        float(rng.uniform(0.35, 0.55)),
-        float(rng.uniform(0.45, 1.15)),
+        n * between(rng, 0.38, 0.6),
+        between(rng, 0.35, 0.55),
+        between(rng, 0.45, 1.15),
     )
     foot = float(rng.choice([0.0, 0.06, 0.15]))
     s.box((-w / 2, 0, foot), (w, d, h - foot), c)
@@ -43,8 +43,8 @@ def chest(rng: np.random.Generator) -> Piece:
 def bookshelf(rng: np.random.Generator) -> Piece:
     """Boards between two sides, full of books and things."""
     s, c = Solids(), color(rng)
-    w, d, h = float(rng.uniform(0.5, 1.3)), float(rng.uniform(0.24, 0.42)), float(rng.uniform(1.0, 2.2))
-    thick = float(rng.uniform(0.015, 0.035))
+    w, d, h = between(rng, 0.5, 1.3), between(rng, 0.24, 0.42), between(rng, 1.0, 2.2)
+    thick = between(rng, 0.015, 0.035)
     rows = max(2, round(h / rng.uniform(0.28, 0.42)))
     for x in (-w / 2, w / 2 - thick):
         s.box((x, 0, 0), (thick, d, h), c)
@@ -66,8 +66,8 @@ def bookshelf(rng: np.random.Generator) -> Piece:
 def wall_shelf(rng: np.random.Generator) -> Piece:
     """Boards on brackets at eye height, with books."""
     s, c = Solids(), color(rng)
-    w, d, n = float(rng.uniform(0.6, 1.5)), float(rng.uniform(0.18, 0.3)), int(rng.integers(1, 4))
-    z0, shelves = float(rng.uniform(1.1, 1.5)), []
+    w, d, n = between(rng, 0.6, 1.5), between(rng, 0.18, 0.3), int(rng.integers(1, 4))
+    z0, shelves = between(rng, 1.1, 1.5), []
     for k in range(n):
         z = z0 + 0.33 * k
         s.box((-w / 2, 0, z), (w, d, 0.025), c)
@@ -83,8 +83,8 @@ def wall_shelf(rng: np.random.Generator) -> Piece:
 def picture(rng: np.random.Generator) -> Piece:
     """A frame, board or screen on the wall."""
     s = Solids()
-    w, h, d = float(rng.uniform(0.25, 1.6)), float(rng.uniform(0.2, 1.0)), float(rng.uniform(0.015, 0.08))
-    z = float(rng.uniform(1.2, 1.6)) - h / 2 + 0.2
+    w, h, d = between(rng, 0.25, 1.6), between(rng, 0.2, 1.0), between(rng, 0.015, 0.08)
+    z = between(rng, 1.2, 1.6) - h / 2 + 0.2
     s.box((-w / 2, 0, z), (w, d, h), color(rng))
     if rng.random() < 0.5:
         s.box((-w / 2 + 0.03, d - 0.01, z + 0.03), (w - 0.06, 0.02, h - 0.06), color(rng))
@@ -94,22 +94,22 @@ def picture(rng: np.random.Generator) -> Piece:
 def lamp(rng: np.random.Generator) -> Piece:
     """A floor lamp."""
     s, c = Solids(), color(rng)
-    h, r = float(rng.uniform(1.3, 1.9)), float(rng.uniform(0.12, 0.25))
+    h, r = between(rng, 1.3, 1.9), between(rng, 0.12, 0.25)
     s.cylinder((0, 0.2, 0), 0.15, 0.03, c)
     s.cylinder((0, 0.2, 0), 0.015, h, c)
-    s.cylinder((0, 0.2, h - 0.25), r, 0.28, color(rng), r * float(rng.uniform(0.5, 1.0)))
+    s.cylinder((0, 0.2, h - 0.25), r, 0.28, color(rng), r * between(rng, 0.5, 1.0))
     return Piece("lamp", s, 0.4, 0.4, h)
 
 
 def plant(rng: np.random.Generator) -> Piece:
     """A pot with leaves."""
     s = Solids()
-    r, h = float(rng.uniform(0.1, 0.2)), float(rng.uniform(0.4, 1.5))
+    r, h = between(rng, 0.1, 0.2), between(rng, 0.4, 1.5)
     s.cylinder((0, 0.2, 0), r * 0.8, 0.25, color(rng), r)
     s.rod((0, 0.2, 0.2), (0, 0.2, 0.2 + h * 0.5), 0.015)
     for _ in range(int(rng.integers(8, 30))):
-        a, reach = rng.uniform(0, 2 * np.pi), float(rng.uniform(0.02, 0.32))
-        z = 0.25 + h * float(rng.uniform(0.25, 1.0))
+        a, reach = rng.uniform(0, 2 * np.pi), between(rng, 0.02, 0.32)
+        z = 0.25 + h * between(rng, 0.25, 1.0)
         size = rng.uniform(0.03, 0.13, 2)
         center = (reach * float(np.cos(a)), 0.2 + reach * float(np.sin(a)), z)
         s.blob(center, (float(size[0]), float(size[1]), 0.03), rng, 0.3, (0.3, 0.5, 0.25))
@@ -120,7 +120,7 @@ def counter(rng: np.random.Generator) -> Piece:
     """A run of kitchen units: cupboards below and above, sink, oven, taps, tiles."""
     s, c = Solids(), color(rng)
     n = int(rng.integers(2, 6))
-    each, d, h = float(rng.uniform(0.4, 0.65)), float(rng.uniform(0.58, 0.65)), float(rng.uniform(0.85, 0.95))
+    each, d, h = between(rng, 0.4, 0.65), between(rng, 0.58, 0.65), between(rng, 0.85, 0.95)
     w = n * each
     s.box((-w / 2, 0, 0.1), (w, d - 0.03, h - 0.14), c)
     s.box((-w / 2, 0, 0), (w, d - 0.1, 0.1), c)
@@ -139,7 +139,7 @@ def counter(rng: np.random.Generator) -> Piece:
         else:
             s.box((x, 0, h - 0.04), (each, d + overhang, 0.04), top)
     if rng.random() < 0.7:
-        up, z = float(rng.uniform(0.3, 0.38)), float(rng.uniform(1.35, 1.5))
+        up, z = between(rng, 0.3, 0.38), between(rng, 1.35, 1.5)
         for k in range(n):
             if rng.random() < 0.8:
                 x, tall = -w / 2 + k * each, float(rng.choice([0.6, 0.6, 0.35]))
@@ -154,7 +154,7 @@ def counter(rng: np.random.Generator) -> Piece:
 def fridge(rng: np.random.Generator) -> Piece:
     """A fridge, washing machine or oven tower."""
     s, c = Solids(), color(rng)
-    w, d, h = float(rng.uniform(0.55, 0.75)), float(rng.uniform(0.55, 0.7)), float(rng.uniform(0.85, 1.95))
+    w, d, h = between(rng, 0.55, 0.75), between(rng, 0.55, 0.7), between(rng, 0.85, 1.95)
     s.box((-w / 2, 0, 0), (w, d, h), c)
     fronts(s, rng, -w / 2, w, d, 0.05, h, int(rng.integers(1, 3)), c)
     return Piece("fridge", s, w, d, h, [Shelf((-w / 2, w / 2), (0, d), h, 0.4)])
@@ -172,7 +172,7 @@ def toilet(rng: np.random.Generator) -> Piece:
 def bathtub(rng: np.random.Generator) -> Piece:
     """A tub along the wall."""
     s = Solids()
-    w, d, h = float(rng.uniform(1.4, 1.8)), float(rng.uniform(0.7, 0.85)), float(rng.uniform(0.5, 0.6))
+    w, d, h = between(rng, 1.4, 1.8), between(rng, 0.7, 0.85), between(rng, 0.5, 0.6)
     for x, y, sx, sy in (
         (-w / 2, 0, w, 0.08),
         (-w / 2, d - 0.08, w, 0.08),
@@ -188,7 +188,7 @@ def bathtub(rng: np.random.Generator) -> Piece:
 def washbasin(rng: np.random.Generator) -> Piece:
     """A basin on a pillar or a cupboard, a mirror cabinet above."""
     s, c = Solids(), color(rng)
-    w, d, h = float(rng.uniform(0.45, 0.9)), float(rng.uniform(0.4, 0.5)), float(rng.uniform(0.8, 0.9))
+    w, d, h = between(rng, 0.45, 0.9), between(rng, 0.4, 0.5), between(rng, 0.8, 0.9)
     s.blob((0, d / 2, h - 0.06), (w / 2, d / 2, 0.1), rng)
     if rng.random() < 0.5:
         s.cylinder((0, 0.15, 0), 0.1, h - 0.1)
@@ -196,7 +196,7 @@ def washbasin(rng: np.random.Generator) -> Piece:
         s.box((-w / 2, 0, 0.1), (w, d * 0.8, h - 0.2), c)
         fronts(s, rng, -w / 2, w, d * 0.8, 0.12, h - 0.12, 2, c)
     s.rod((0, 0.05, h), (0, 0.15, h + 0.15), 0.015)
-    s.box((-w / 2, 0, h + 0.35), (w, float(rng.uniform(0.02, 0.15)), 0.6), c)
+    s.box((-w / 2, 0, h + 0.35), (w, between(rng, 0.02, 0.15), 0.6), c)
     return Piece("washbasin", s, w, d, h)
 
 
@@ -204,14 +204,14 @@ def boxes(rng: np.random.Generator) -> Piece:
     """A pile of cartons, bags and bins on the floor."""
     s = Solids()
     z, top = 0.0, 0.0
-    w = float(rng.uniform(0.3, 0.6))
+    w = between(rng, 0.3, 0.6)
     if rng.random() < 0.3:
-        r = float(rng.uniform(0.12, 0.2))
-        h = float(rng.uniform(0.25, 0.6))
+        r = between(rng, 0.12, 0.2)
+        h = between(rng, 0.25, 0.6)
         s.cylinder((0, r, 0), r * 0.8, h, color(rng), r)
         return Piece("bin", s, 2 * r, 2 * r, h)
     if rng.random() < 0.3:
-        h = float(rng.uniform(0.25, 0.5))
+        h = between(rng, 0.25, 0.5)
         s.blob((0, 0.2, h / 2), (w / 2, 0.18, h / 2), rng, 0.35, color(rng))
         return Piece("bag", s, w, 0.4, h)
     for _ in range(int(rng.integers(1, 4))):
@@ -225,7 +225,7 @@ def boxes(rng: np.random.Generator) -> Piece:
 def radiator(rng: np.random.Generator) -> Piece:
     """Ribs under a window."""
     s = Solids()
-    w, h, z = float(rng.uniform(0.5, 1.4)), float(rng.uniform(0.4, 0.7)), 0.12
+    w, h, z = between(rng, 0.5, 1.4), between(rng, 0.4, 0.7), 0.12
     ribs = max(3, int(w / 0.09))
     for k in range(ribs):
         s.box((-w / 2 + k * w / ribs, 0.04, z), (0.06, 0.1, h))

@@ -15,6 +15,7 @@ import numpy as np
 from geomoe3d.config import Section
 from geomoe3d.data.rooms.scenes import Scene
 from geomoe3d.data.rooms.sensor import Camera, Hits, cast
+from geomoe3d.data.rooms.solids import between
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.types import FloatArray
 
@@ -154,16 +155,16 @@ def _propose(
     if last is None:
         x0, y0, x1, y1 = scene.areas[int(rng.integers(len(scene.areas)))]
         x, y = rng.uniform([x0 + 0.3, y0 + 0.3], [max(x1 - 0.3, x0 + 0.31), max(y1 - 0.3, y0 + 0.31)])
-        yaw = float(rng.uniform(0, 360))
+        yaw = between(rng, 0, 360)
     elif around:
         ahead = np.array([np.cos(np.radians(last.yaw)), np.sin(np.radians(last.yaw))])
-        target = last.eye[:2] + float(rng.uniform(1.6, 2.6)) * ahead
+        target = last.eye[:2] + between(rng, 1.6, 2.6) * ahead
         bearing = np.radians(last.yaw + 180 + float(rng.normal(0, settings.around_deg)))
-        x, y = target + float(rng.uniform(1.3, 3.0)) * np.array([np.cos(bearing), np.sin(bearing)])
+        x, y = target + between(rng, 1.3, 3.0) * np.array([np.cos(bearing), np.sin(bearing)])
         yaw = float(np.degrees(np.arctan2(target[1] - y, target[0] - x)) + rng.normal(0, 12))
     else:
         way = settings.step * float(rng.lognormal(0, 0.8))
-        angle = float(rng.uniform(0, 2 * np.pi))
+        angle = between(rng, 0, 2 * np.pi)
         x, y = last.eye[:2] + way * np.array([np.cos(angle), np.sin(angle)])
         yaw = last.yaw + float(rng.normal(0, settings.turn_deg))
         pitch = float(np.clip(last.pitch + rng.normal(0, 8), -65, 25))

@@ -24,6 +24,9 @@ def test_train_verb_says_what_is_wrong_and_overfits(tmp_path: Path) -> None:
     assert wrong.returncode == 2
     assert "network.num_layers" in wrong.stderr
     assert not (tmp_path / "runs").exists()
+    renamed = call(path, "--fresh")
+    assert renamed.returncode == 2
+    assert "--fresh is now --new" in renamed.stderr
     shown = call(path, "steps=7", "--show")
     assert shown.returncode == 0
     assert "steps: 7" in shown.stdout

@@ -31,7 +31,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
-@click.option("--page", is_flag=True, help="Write OUT/page.html with a picture of every pair.")
+@click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
 @click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier batch.")
 @click.option("--retry", is_flag=True, help="Try pairs again that could not be registered.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")

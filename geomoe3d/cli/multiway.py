@@ -52,7 +52,7 @@ _SHOWN = 20
 @click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
 @click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
-@click.option("--no-page", is_flag=True, help="Do not write OUT/page.html.")
+@click.option("--page/--no-page", default=True, help="Write OUT/page.html or not. [write it]")
 @click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier model.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
@@ -71,7 +71,7 @@ def command(
     seed: str | None,
     config_file: str | None,
     assignments: tuple[str, ...],
-    no_page: bool,
+    page: bool,
     fresh: bool,
     cache: str | None,
     quiet: bool,
@@ -104,7 +104,7 @@ def command(
             neighbors=neighbors,
             rounds=rounds,
             merged_voxel_size=model_voxel_size,
-            page=not no_page,
+            page=page,
             workers=ALL_THAT_FIT if workers is None and scheduler is None else workers,
             scheduler=scheduler,
             cache=cache,

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 @click.argument("config", type=click.Path())
 @click.argument("assignments", nargs=-1, metavar="[KEY=VALUE]...")
 @click.option("--out", type=click.Path(), help="Run folder (default: runs/ and the name of CONFIG).")
-@click.option("--fresh", is_flag=True, help="Refuse to go on with a run that is there.")
+@click.option("--new", is_flag=True, help="Refuse to continue a run that is there.")
+@click.option("--fresh", is_flag=True, hidden=True)
 @click.option("--overfit", is_flag=True, help="Overfit one batch (sanity check); writes nothing.")
 @click.option("--show", is_flag=True, help="Print the complete configuration and stop.")
 @click.option("--quiet", is_flag=True, help="Print nothing but the summary.")
@@ -30,6 +31,7 @@ def command(
     config: str,
     assignments: tuple[str, ...],
     out: str | None,
+    new: bool,
     fresh: bool,
     overfit: bool,
     show: bool,
@@ -43,6 +45,8 @@ def command(
     """
     from geomoe3d.training.config import load_train_config
 
+    if fresh:  # elsewhere it removes what is there
+        raise click.UsageError("--fresh is now --new, which refuses to continue a run that is there")
     settings = load_train_config(config, list(assignments))
     if show:
         import yaml
@@ -51,16 +55,16 @@ def command(
     elif overfit:
         context.exit(_overfit(settings, quiet))
     else:
-        context.exit(_train(settings, Path(out) if out else Path("runs") / Path(config).stem, fresh, quiet))
+        context.exit(_train(settings, Path(out) if out else Path("runs") / Path(config).stem, new, quiet))
 
 
-def _train(settings: TrainConfig, folder: Path, fresh: bool, quiet: bool) -> int:
+def _train(settings: TrainConfig, folder: Path, new: bool, quiet: bool) -> int:
     from geomoe3d.cli.train_display import Display
     from geomoe3d.training.distributed import leave
     from geomoe3d.training.trainer import TrainingRun
 
     try:
-        run = TrainingRun(settings, folder, fresh=fresh)
+        run = TrainingRun(settings, folder, fresh=new)
         if run.process.world == 1:
             _stop_gently(run)
         with Display(quiet or not run.process.is_first) as display:

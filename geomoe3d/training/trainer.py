@@ -268,7 +268,7 @@ class TrainingRun:
         except OSError as error:
             raise OutputError(f"cannot use '{self.folder}' as run folder: {error.strerror}") from None
         if fresh and self.last_path.exists():
-            raise OutputError(f"'{self.folder}' holds a run already; give another folder, or leave --fresh")
+            raise OutputError(f"'{self.folder}' holds a run already; give another folder, or leave out --new")
         if not self.last_path.exists() and (self.folder / "weights.safetensors").exists():
             raise OutputError(f"'{self.folder}' holds weights but no run to go on with; give another folder")
 

@@ -193,6 +193,18 @@ def test_over_scenes_a_scene_comes_with_all_its_pairs() -> None:
         assert measure(values, scenes, unit="%", statistic=statistic).scene_interval == (0.0, 75.0)
 
 
+def test_over_scenes_of_one_size_both_means_are_one() -> None:
+    """A scene that is drawn twice counts twice in either mean."""
+    rng = np.random.default_rng(8)
+    values, scenes = (
+        100.0 * (rng.random(120) < np.repeat([0.2, 0.5, 0.9, 0.95], 30)),
+        np.repeat(list("abcd"), 30),
+    )
+    by_pair, by_scene = (measure(values, scenes, unit="%", statistic=s) for s in ("mean", "scene_mean"))
+    assert by_scene.value == pytest.approx(by_pair.value)
+    assert by_scene.scene_interval == pytest.approx(by_pair.scene_interval)
+
+
 def test_over_scenes_medians_too() -> None:
     found = measure([1.0, 1.0, 5.0, 5.0, 5.0], list("aabbb"), unit="cm", statistic=0.5)
     assert (found.value, found.scene_interval) == (5.0, (1.0, 5.0))

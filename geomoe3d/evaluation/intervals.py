@@ -89,14 +89,19 @@ def measure_all(
     if n == 0:
         return {name: Measure(math.nan, q.unit, 0, _UNDEFINED, _UNDEFINED) for name, q in quantities.items()}
     statistics = [_statistic(quantity, labels) for quantity in quantities.values()]
-    points = [float(statistic(np.ones((1, n)))[0]) for statistic in statistics]
-    over_pairs, over_scenes = np.random.SeedSequence(seed).spawn(2)
-    pair_blocks = _draws(n, n, resamples, np.random.Generator(np.random.PCG64(over_pairs)))
-    scene_blocks = _draws(len(names), n, resamples, np.random.Generator(np.random.PCG64(over_scenes)))
-    pair_samples, scene_samples = (
-        np.concatenate([[statistic(counts) for statistic in statistics] for counts in blocks], axis=1)
-        for blocks in (pair_blocks, (counts[:, labels] for counts in scene_blocks))
+    points = [float(statistic(np.ones((1, n)), np.ones((1, len(names))))[0]) for statistic in statistics]
+    over_pairs, over_scenes = (
+        np.random.Generator(np.random.PCG64(stream)) for stream in np.random.SeedSequence(seed).spawn(2)
     )
+    pair_samples = [
+        [statistic(counts, np.ones((len(counts), len(names)))) for statistic in statistics]
+        for counts in _draws(n, n, resamples, over_pairs)
+    ]
+    scene_samples = [
+        [statistic(drawn[:, labels], drawn) for statistic in statistics]
+        for drawn in _draws(len(names), n, resamples, over_scenes)
+    ]
+    by_pair, by_scene = np.concatenate(pair_samples, axis=1), np.concatenate(scene_samples, axis=1)
     found = {}
     for row, (name, quantity) in enumerate(quantities.items()):
         counted = ~np.isnan(quantity.values)
@@ -106,9 +111,9 @@ def measure_all(
             interval = wilson(value / 100.0, count)
         else:
             if count >= 2:
-                interval = _interval(pair_samples[row], value, quantity.reflected)
+                interval = _interval(by_pair[row], value, quantity.reflected)
             if len(np.unique(labels[counted])) >= 2:
-                scene_interval = _interval(scene_samples[row], value, quantity.reflected)
+                scene_interval = _interval(by_scene[row], value, quantity.reflected)
         found[name] = Measure(value, quantity.unit, count, interval, scene_interval)
     return found
 
@@ -154,28 +159,31 @@ def quantile(values: FloatArray, counts: FloatArray, q: float) -> FloatArray:
     return np.where(total > 0, between, np.nan)
 
 
-def _statistic(quantity: Quantity, labels: IntArray) -> Statistic:
-    """A quantity as a function of counts; ``labels`` (n,) number the pairs' scenes."""
+def _statistic(quantity: Quantity, labels: IntArray) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """A quantity as a function of counts (B, n) and of how often each scene was drawn as a whole (B, S).
+
+    ``labels`` (n,) number the pairs' scenes from 0 to S - 1.
+    """
     statistic, values = quantity.statistic, quantity.values
     if isinstance(statistic, (int, float)):
-        return lambda counts: quantile(values, counts, float(statistic))
+        return lambda counts, drawn: quantile(values, counts, float(statistic))
     if callable(statistic):
-        return statistic
+        return lambda counts, drawn: statistic(counts)
     if statistic not in ("mean", "scene_mean"):
         raise InputError(f"there is no statistic '{statistic}'; there are mean and scene_mean")
     if np.isinf(values).any():
         raise InputError("a mean of infinite values was asked for; leave them out (NaN) or take a median")
-    # One column per group of pairs whose mean is taken: all of them, or each scene.
-    groups = np.ones((len(values), 1)) if statistic == "mean" else np.eye(labels.max() + 1)[labels]
-    counted = groups * ~np.isnan(values)[:, None]
-    sums = counted * np.nan_to_num(values)[:, None]
+    counted, known = ~np.isnan(values), np.nan_to_num(values)
+    if statistic == "mean":
+        return lambda counts, drawn: _ratio(counts @ known, counts @ counted.astype(np.float64))
+    in_scene = np.eye(labels.max() + 1)[labels]
 
-    def mean(counts: FloatArray) -> FloatArray:
-        rates = _ratio(counts @ sums, counts @ counted)
+    def scene_mean(counts: FloatArray, drawn: FloatArray) -> FloatArray:
+        rates = _ratio(counts @ (in_scene * known[:, None]), counts @ (in_scene * counted[:, None]))
         there = ~np.isnan(rates)
-        return _ratio(np.where(there, rates, 0.0).sum(axis=1), there.sum(axis=1))
+        return _ratio((drawn * np.where(there, rates, 0.0)).sum(axis=1), (drawn * there).sum(axis=1))
 
-    return mean
+    return scene_mean
 
 
 def _ratio(sums: NDArray[Any], counts: NDArray[Any]) -> FloatArray:

@@ -143,10 +143,7 @@ class Prediction:
 
     Attributes:
         pair: id of the pair.
-        T_target_source: (4, 4) or None.
-        confidence: as in `Answer`.
-        status: as in `Answer`.
-        hypotheses: as in `Answer`.
+        T_target_source, confidence, status, hypotheses: as in `Answer`.
         labels: what became of the correspondences; None where the method shows none.
         weights: (N,) as in `Answer`, half precision, or None.
         seconds: wall time of the call; NaN where its process died over it.
@@ -219,12 +216,7 @@ class PairScore:
         any_right: whether the answer or any hypothesis is right.
         precision, recall, f1: of the method's own classification; 0 where undefined, None without labels.
         verified_precision, verified_recall, verified_f1: of the labels that the motion gives.
-        confidence: as predicted.
-        status: as predicted.
-        seconds: wall time; NaN where it is not known.
-        stages: wall time per stage.
-        peak_memory: bytes.
-        error: as predicted.
+        confidence, status, seconds, stages, peak_memory, error: as in `Prediction`.
     """
 
     pair: str

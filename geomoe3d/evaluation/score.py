@@ -73,7 +73,7 @@ def compare_all(runs: list[ScoredRun]) -> list[Comparison]:
     return [
         compare(one.score, other.score)
         for one, other in combinations(runs, 2)
-        if _task_of(one) == _task_of(other) and one.score.info.benchmark != UNRELATED
+        if _input_of(one) == _input_of(other) and one.score.info.benchmark != UNRELATED
     ]
 
 
@@ -104,6 +104,6 @@ def write_report(path: str | Path, runs: list[ScoredRun], *, force: bool = False
     write_text(path, text.rstrip() + "\n", force=force)
 
 
-def _task_of(run: ScoredRun) -> tuple[str, str, str]:
+def _input_of(run: ScoredRun) -> tuple[str, str, str]:
     info = run.score.info
     return info.track, info.benchmark, str(info.identity.get("pairs"))

@@ -34,8 +34,8 @@ from geomoe3d.correspondence_registration import CorrespondenceSolver
 from geomoe3d.data.threedmatch import BENCHMARKS, FixedCorrespondences, iterate_fixed_correspondences
 from geomoe3d.evaluation.compare import mcnemar_p
 from geomoe3d.evaluation.intervals import Quantity, measure_all
+from geomoe3d.evaluation.metrics import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
-from geomoe3d.evaluation.score import is_right, motion_errors, precision_recall_f1
 from geomoe3d.filters.base import Filter, make_filter
 from geomoe3d.filters.correspondence_network import NetworkFilter
 from geomoe3d.filters.network import GeoMoEFilter

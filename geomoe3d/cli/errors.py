@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import click
 
 from geomoe3d.errors import GeoMoE3DError
+from geomoe3d.runtime.home import ensure_home
 
 OK, FAULT, BAD_INPUT, NOT_SURE, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 3, 130, 141
 
@@ -41,6 +42,7 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
         from click.shell_completion import shell_complete
 
         return shell_complete(command, {}, name, f"_{name.upper()}_COMPLETE", completing)
+    ensure_home()
     words = list(sys.argv[1:] if arguments is None else arguments)
     wanted: dict[str, Any] = {
         _TRACEBACK: os.environ.get("GEOMOE3D_TRACEBACK", "") not in ("", "0"),

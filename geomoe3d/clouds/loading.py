@@ -37,6 +37,7 @@ from geomoe3d.clouds.formats.registry import READERS
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, NonFiniteError
 from geomoe3d.geometry.columns import finite_rows
+from geomoe3d.runtime.home import ensure_home
 from geomoe3d.types import FloatArray, PointCloud
 
 MAX_COORDINATE = 1e12
@@ -232,6 +233,11 @@ def _unpacked(path: Path) -> Iterator[Path]:
     Raises:
         FormatError: no gzip file, damaged, or unpacking to more than 200 times its size.
     """
+    ensure_home()
+    try:
+        tempfile.gettempdir()
+    except FileNotFoundError:
+        raise InputError(f"'{path}' cannot be unpacked: no folder for temporary files; set TMPDIR") from None
     with tempfile.TemporaryDirectory(prefix="geomoe3d-") as folder:
         plain = Path(folder, path.with_suffix("").name)
         try:

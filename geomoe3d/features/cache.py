@@ -26,6 +26,7 @@ import numpy as np
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.home import ensure_home, own_temporary_folder
 from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
 DEFAULT_MAX_BYTES = 4 * 2**30
@@ -46,12 +47,24 @@ CACHE_VARIABLE = "GEOMOE3D_CACHE"
 
 
 def default_cache_folder() -> Path:
-    """The user's own: ``GEOMOE3D_CACHE``, else ``geomoe3d`` in the system's folder for caches."""
+    """The user's own: ``GEOMOE3D_CACHE``, else ``geomoe3d`` in the system's folder for caches.
+
+    Where there is no such folder and none can be made, one of the user's own among temporary files.
+    """
     given = os.environ.get(CACHE_VARIABLE)
     if given:
         return Path(given)
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "geomoe3d" / "described"
+    ensure_home()
+    folder = (Path(base) if base else Path.home() / ".cache") / "geomoe3d" / "described"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    except OSError:
+        pass
+    temporary = own_temporary_folder()
+    return folder if temporary is None else temporary / "described"
 
 
 class DescriptionCache:

@@ -4,3 +4,7 @@ All three take one `view.RegistrationView`. `picture.save_picture` needs matplot
 `page.save_page` needs nothing but the standard library and numpy, `window.show_window` needs Open3D and a
 display. Nothing here changes a number of the result.
 """
+
+from geomoe3d.runtime.home import ensure_home
+
+ensure_home()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from geomoe3d.clouds.formats.raw import RawCloud
+from geomoe3d.clouds.formats.registry import CLOUD_WRITERS
 from geomoe3d.clouds.io import load_points
 from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import make_transform
@@ -83,3 +86,51 @@ def assert_on_box(points: np.ndarray, num: int) -> None:
     )
     shares = np.bincount(side, minlength=6) / num
     assert np.abs(shares - 1 / 6).max() < 5 * np.sqrt(1 / 6 * 5 / 6 / num)
+
+
+# ---- files with all that their format can hold ---------------------------------------------------------
+
+FULL = 60
+COLORS = np.random.default_rng(2).integers(1, 256, (FULL, 3)) / 255
+FIELDS = {
+    "intensity": np.random.default_rng(3).integers(1, 4000, FULL).astype(np.uint16),
+    "ring": (np.arange(FULL) % 32).astype(np.uint8),
+    "gps_time": np.linspace(1e5, 1e5 + 1, FULL),
+    "reflectance": np.linspace(-1, 1, FULL).astype(np.float32),
+    "number": np.arange(FULL, dtype=np.int64) + 2**40,
+}
+
+
+def _full_points() -> np.ndarray:
+    cloud = small_cloud(FULL).astype(np.float32).astype(np.float64)
+    cloud[[3, 30]] = 0.0  # no return
+    return cloud
+
+
+def write_full(path: Path) -> None:
+    """A file with all that its format can hold."""
+    suffix, xyz = path.suffix, _full_points()
+    if suffix in CLOUD_WRITERS:
+        with path.open("wb") as handle:
+            CLOUD_WRITERS[suffix](handle, RawCloud(xyz, unit_vectors(FULL), COLORS, fields=FIELDS))
+        return
+    rows = np.column_stack([xyz, FIELDS["intensity"], np.rint(COLORS * 255)])
+    if suffix in (".pts", ".ptx"):
+        pose = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+        path.write_text(f"{FULL}\n" if suffix == ".pts" else f"{FULL}\n1\n{pose}")
+        with path.open("a") as handle:
+            np.savetxt(handle, rows, fmt="%.17g")
+    elif suffix == ".bin":
+        path.write_bytes(np.column_stack([rows[:, :4], FIELDS["ring"]]).astype("<f4").tobytes())
+    elif suffix == ".vtk":
+        text = f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\nPOINTS {FULL} double\n"
+        text += "\n".join(" ".join(map(repr, row)) for row in xyz.tolist())
+        text += f"\nPOINT_DATA {FULL}\nSCALARS ring int\nLOOKUP_TABLE default\n"
+        path.write_text(text + "\n".join(map(str, FIELDS["ring"].tolist())) + "\n")
+    else:
+        trimesh = pytest.importorskip("trimesh")
+        box = trimesh.creation.icosphere(2)
+        box.visual.vertex_colors = np.full((len(box.vertices), 4), 90, np.uint8)
+        box.export(path)
+        if suffix == ".obj":
+            path.write_text(path.read_text() + "vt 0 0\nvn 0 0 1\nusemtl paint\nf 1/1/1 2/1/1 3/1/1\n")

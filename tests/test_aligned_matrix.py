@@ -6,58 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_files import rigid, small_cloud, unit_vectors
+from cloud_files import rigid, write_full
 
 from geomoe3d.clouds.formats.raw import RawCloud
-from geomoe3d.clouds.formats.registry import CLOUD_WRITERS
 from geomoe3d.clouds.io import READABLE_SUFFIXES, WRITABLE_MESH_SUFFIXES, WRITABLE_SUFFIXES, save_aligned
 from geomoe3d.clouds.loading import finite_part, read_raw
 
 T = rigid(7)
-N = 60
-COLORS = np.random.default_rng(2).integers(1, 256, (N, 3)) / 255
-FIELDS = {
-    "intensity": np.random.default_rng(3).integers(1, 4000, N).astype(np.uint16),
-    "ring": (np.arange(N) % 32).astype(np.uint8),
-    "gps_time": np.linspace(1e5, 1e5 + 1, N),
-    "reflectance": np.linspace(-1, 1, N).astype(np.float32),
-    "number": np.arange(N, dtype=np.int64) + 2**40,
-}
-
-
-def points() -> np.ndarray:
-    cloud = small_cloud(N).astype(np.float32).astype(np.float64)
-    cloud[[3, 30]] = 0.0  # no return
-    return cloud
-
-
-def full(path: Path) -> None:
-    """A file with all that its format can hold."""
-    suffix, xyz = path.suffix, points()
-    if suffix in CLOUD_WRITERS:
-        with path.open("wb") as handle:
-            CLOUD_WRITERS[suffix](handle, RawCloud(xyz, unit_vectors(N), COLORS, fields=FIELDS))
-        return
-    rows = np.column_stack([xyz, FIELDS["intensity"], np.rint(COLORS * 255)])
-    if suffix in (".pts", ".ptx"):
-        pose = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
-        path.write_text(f"{N}\n" if suffix == ".pts" else f"{N}\n1\n{pose}")
-        with path.open("a") as handle:
-            np.savetxt(handle, rows, fmt="%.17g")
-    elif suffix == ".bin":
-        path.write_bytes(np.column_stack([rows[:, :4], FIELDS["ring"]]).astype("<f4").tobytes())
-    elif suffix == ".vtk":
-        text = f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\nPOINTS {N} double\n"
-        text += "\n".join(" ".join(map(repr, row)) for row in xyz.tolist())
-        text += f"\nPOINT_DATA {N}\nSCALARS ring int\nLOOKUP_TABLE default\n"
-        path.write_text(text + "\n".join(map(str, FIELDS["ring"].tolist())) + "\n")
-    else:
-        trimesh = pytest.importorskip("trimesh")
-        box = trimesh.creation.icosphere(2)
-        box.visual.vertex_colors = np.full((len(box.vertices), 4), 90, np.uint8)
-        box.export(path)
-        if suffix == ".obj":
-            path.write_text(path.read_text() + "vt 0 0\nvn 0 0 1\nusemtl paint\nf 1/1/1 2/1/1 3/1/1\n")
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +22,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sources")
     for suffix in READABLE_SUFFIXES:
         if suffix != ".gltf":
-            full(folder / f"a{suffix}")
+            write_full(folder / f"a{suffix}")
     return folder
 
 
@@ -118,7 +73,7 @@ def check(source: RawCloud, found: RawCloud, lost: tuple[str, ...], target: str)
 
 def test_fields_keep_their_types(tmp_path: Path) -> None:
     for suffix in (".ply", ".pcd", ".npz", ".las"):
-        full(tmp_path / f"a{suffix}")
+        write_full(tmp_path / f"a{suffix}")
         kept = read_raw(tmp_path / f"a{suffix}").fields
         assert {name: kept[name].dtype for name in ("intensity", "ring", "gps_time", "reflectance")} == {
             **{"intensity": np.uint16, "ring": np.uint8, "gps_time": np.float64, "reflectance": np.float32}

@@ -250,6 +250,14 @@ def test_lists_of_vertices_are_stepped_over(tmp_path: Path, fmt: str, ragged: bo
     fails(tmp_path / "a.ply", "says 300 rows of 'vertex'", "holds 200;")
 
 
+@pytest.mark.parametrize("fmt", ["ascii", "binary_little_endian"])
+def test_a_cloud_may_declare_no_faces(tmp_path: Path, fmt: str) -> None:
+    more = b"element face 0\nproperty list uchar int vertex_indices\nproperty uchar flag\nend_header\n"
+    (tmp_path / "a.ply").write_bytes(ply(50, 50, fmt).replace(b"end_header\n", more))
+    assert read_raw(tmp_path / "a.ply").faces is None
+    assert np.array_equal(load_points(tmp_path / "a.ply").file_points, small_cloud(50))
+
+
 def test_ascii_values_may_run_over_lines(tmp_path: Path) -> None:
     words = ply(50, 50).decode().split("end_header\n")
     (tmp_path / "a.ply").write_text(words[0] + "end_header\n" + "\n".join(words[1].split()) + "\n")

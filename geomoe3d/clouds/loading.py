@@ -206,10 +206,11 @@ def read_raw(data: Any) -> RawCloud:
             raise FormatError(unknown_suffix(inner, READABLE_SUFFIXES, "readable"))
         if size == 0:
             raise EmptyCloudError(f"'{path}' is an empty file (0 bytes)")
-        if inner is not path:
-            with _unpacked(path) as plain:
-                return _raw(reader(plain))
-        return _raw(reader(path))
+        with np.errstate(all="ignore"):  # files hold all kinds of numbers; what is not finite is dropped
+            if inner is not path:
+                with _unpacked(path) as plain:
+                    return _raw(reader(plain))
+            return _raw(reader(path))
     except FileNotFoundError as error:
         if error.filename is not None and Path(error.filename) != path:
             raise FormatError(f"'{path}' refers to a missing file '{error.filename}'") from None

@@ -186,7 +186,18 @@ def save_aligned(
         FormatError: as `check_aligned`.
         OutputError: as `check_cloud_output`, or the disk refuses.
     """
-    T = _rigid(T_target_source)
+    with np.errstate(all="ignore"):  # normals and fields may be any numbers
+        return _save_aligned(path, source, _rigid(T_target_source), precision, force, remark)
+
+
+def _save_aligned(
+    path: str | os.PathLike[str],
+    source: Any,
+    T: FloatArray,
+    precision: str,
+    force: bool,
+    remark: Callable[[str], None],
+) -> tuple[str, ...]:
     path = check_aligned(path, source, precision=precision, force=force)
     suffix = path.suffix.lower()
     file = Path(source) if isinstance(source, (str, os.PathLike)) else None

@@ -7,6 +7,7 @@ themselves are in `transform_formats`.
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Sequence
@@ -157,7 +158,7 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
         with path.open("rb") as handle:
             data = handle.read(_LARGEST_TEXT)
         if data[:6] == b"\x93NUMPY":
-            T = of_matrix(np.asarray(np.load(path, allow_pickle=False), dtype=np.float64))
+            T = _of_npy(data)
         elif b"\0" in data or len(data) == _LARGEST_TEXT:
             raise FormatError("it is no text")
         else:
@@ -171,3 +172,14 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
     if not np.isfinite(T).all():
         raise InputError(f"'{path}' holds no transform, its numbers are not finite")
     return T
+
+
+def _of_npy(data: bytes) -> FloatArray:
+    """The motion of an NPY file; one whose header describes more than memory holds is refused too."""
+    try:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+        return of_matrix(np.asarray(array, dtype=np.float64))
+    except FormatError:
+        raise
+    except Exception as error:  # numpy's header parser has many ways to refuse
+        raise FormatError(f"{type(error).__name__}: {error}") from None

@@ -22,6 +22,8 @@ _NORMAL_KEYS = ("normals", "normal", "nrm")
 _COLOR_KEYS = ("colors", "color", "colours", "colour", "rgb")
 _PICKLED = "holds pickled Python objects, which are not loaded; save a plain float array of shape (N, 3)"
 
+_TOO_LARGE = "describes more numbers than memory holds: its header is wrong, or the machine too small"
+
 
 @reader(".npy")
 def read_npy(path: Path) -> RawCloud:
@@ -34,8 +36,10 @@ def read_npy(path: Path) -> RawCloud:
         with path.open("rb") as handle:
             array = np.load(handle, allow_pickle=False)
             place = handle.tell()
-    except (MemoryError, OSError):
+    except OSError:
         raise
+    except MemoryError:
+        raise FormatError(f"'{path}' {_TOO_LARGE}") from None
     except Exception as error:  # numpy's header parser has many ways to refuse
         raise FormatError(f"'{path}' {_numpy_reason(error)}") from None
     if not isinstance(array, np.ndarray):
@@ -74,8 +78,10 @@ def read_npz(path: Path) -> RawCloud:
                 )
             arrays = [None if key is None else archive[key] for key in wanted]
             others = {key: archive[key] for key in archive.files if key not in wanted}
-    except (FormatError, MemoryError, OSError):
+    except (FormatError, OSError):
         raise
+    except MemoryError:
+        raise FormatError(f"'{path}' {_TOO_LARGE}") from None
     except Exception as error:  # zipfile and zlib have many ways to refuse
         raise FormatError(f"'{path}' {_numpy_reason(error)}") from None
     points, normals, colors = arrays

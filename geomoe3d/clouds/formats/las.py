@@ -51,19 +51,22 @@ def read_las(path: Path) -> RawCloud:
     _check_records(path)
     try:
         with laspy.open(path) as reader:
-            header = reader.header
-            _check_size(path, header)
+            _check_size(path, reader.header)
             las = reader.read()
+            if len(las.points) != reader.header.point_count:
+                raise wrong_count(path, reader.header.point_count, len(las.points))
+            return _cloud(las)
     except (FormatError, PermissionError):
         raise
     except BaseException as error:  # lazrs may panic on damaged data, which is no Exception
         if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError)):
             raise
         raise FormatError(f"'{path}' is no LAS file or damaged: {error}") from None
-    num_points = len(las.points)
-    if num_points != header.point_count:
-        raise wrong_count(path, header.point_count, num_points)
-    points = np.empty((num_points, 3))
+
+
+def _cloud(las: Any) -> RawCloud:
+    """Coordinates, colours, normals and fields of what laspy has read."""
+    points = np.empty((len(las.points), 3))
     for k, axis in enumerate((las.x, las.y, las.z)):
         points[:, k] = axis
     names = list(las.point_format.dimension_names)

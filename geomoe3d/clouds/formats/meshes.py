@@ -52,7 +52,8 @@ def _as_format_errors(path: Path) -> Iterator[None]:
     level = log.level
     log.setLevel(logging.CRITICAL)
     try:
-        yield
+        with np.errstate(all="ignore"):
+            yield
     except (GeoMoE3DError, MemoryError, PermissionError):
         raise
     except Exception as error:

@@ -199,9 +199,8 @@ def _read_rows(
     what = f"rows of '{element.name}'"
     has_lists = any(length is not None for _, _, length in element.properties)
     if not (element.count and element.properties):
-        return _Rows(
-            np.empty(0, [(f"{k}", kind) for k, (_, kind, _) in enumerate(element.properties)])
-        ), place
+        none = [(f"{k}", kind, (0,) * bool(head)) for k, (_, kind, head) in enumerate(element.properties)]
+        return _Rows(np.empty(0, none)), place
     layout = _layout(body, place, order, element)
     if layout is None:
         raise wrong_count(path, element.count, 0, what)

@@ -81,6 +81,9 @@ def columns_by_name(names: Sequence[str]) -> dict[str, list[int]]:
     return found
 
 
+_KIND = {"points": np.float64, "normals": np.float64}  # colours stay as they are: their type says their scale
+
+
 def cloud_of(
     names: Sequence[str],
     columns: Sequence[NDArray[Any]],
@@ -94,7 +97,11 @@ def cloud_of(
     counts, the others are named as unread.
     """
     groups = columns_by_name(names)
-    parts = {group: np.stack([columns[k] for k in chosen], axis=1) for group, chosen in groups.items()}
+    with np.errstate(invalid="ignore"):  # signalling NaNs are dropped later
+        parts = {
+            group: np.stack([np.asarray(columns[k], dtype=_KIND.get(group)) for k in chosen], axis=1)
+            for group, chosen in groups.items()
+        }
     colors = scale_colors(parts["colors"]) if "colors" in parts else None
     if "colors" in groups and colors is None:
         del groups["colors"]
@@ -106,8 +113,8 @@ def cloud_of(
         elif k not in used:
             fields[name] = np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("="))
     return RawCloud(
-        np.asarray(parts["points"], dtype=np.float64),
-        np.asarray(parts["normals"], dtype=np.float64) if "normals" in parts else None,
+        parts["points"],
+        parts.get("normals"),
         colors,
         faces,
         fields,

@@ -30,7 +30,7 @@ geomoe3d data synthesize "$out/rooms" --scenes "$scenes" --workers "$workers" --
   --models "$models" "${meshes[@]}"
 if [ ! -f "$out/lounge/gt_overlap.log" ]; then
   rm -rf "$out/lounge" # a rest of an interrupted run
-  geomoe3d data fragments "$data/rgbd/hololens-lounge" "$out/lounge" --count 25 --grid 0.025 --voxel 0.012
+  geomoe3d data fragments "$data/rgbd/hololens-lounge" "$out/lounge" --count 25 --grid 0.025 --voxel-size 0.012
 fi
 geomoe3d data features "$out/rooms" "$out/features" --workers "$workers"
 geomoe3d data features "$out/lounge" "$out/features"

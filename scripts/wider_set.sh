@@ -32,8 +32,8 @@ motions() { # DESCRIPTIONS NAME PAIRS
   data motions "$set/$1" "$out/$2" --pairs "$3"
 }
 
-data synthesize "$set/scans" recorder=scanner grid=0.05 min_points=1500 --scenes 60 --seed 0 --models "$models"
-data synthesize "$set/bodies" recorder=orbit min_points=1000 --scenes 160 --seed 0 --models "$models"
+data synthesize "$set/scans" --set recorder=scanner --set grid=0.05 --set min_points=1500 --scenes 60 --seed 0 --models "$models"
+data synthesize "$set/bodies" --set recorder=orbit --set min_points=1000 --scenes 160 --seed 0 --models "$models"
 some=()
 for k in $(seq -f '%05g' 0 39); do some+=(--scene "scene-$k"); done
 describe rooms 30 "${some[@]}"

@@ -1,4 +1,4 @@
-"""``geomoe3d train``: what is wrong is said, the configuration shown, one batch learnt by heart."""
+"""``geomoe3d train``: what is wrong is said, the configuration shown, one batch overfitted."""
 
 from __future__ import annotations
 
@@ -20,18 +20,23 @@ def test_train_verb_says_what_is_wrong_and_overfits(tmp_path: Path) -> None:
         )
 
     path = str(write_yaml(tmp_path / "c.yaml", TREE))
-    wrong = call(path, "network.num_layer=3")
+    wrong = call(path, "--set", "network.num_layer=3")
     assert wrong.returncode == 2
     assert "network.num_layers" in wrong.stderr
     assert not (tmp_path / "runs").exists()
-    renamed = call(path, "--fresh")
-    assert renamed.returncode == 2
-    assert "--fresh is now --new" in renamed.stderr
-    shown = call(path, "steps=7", "--show")
+    for old, new in (
+        (["--fresh"], "--fresh is now --new"),
+        (["--out", "x"], "--out is now --output"),
+        (["steps=7"], "write --set steps=7"),
+    ):
+        refused = call(path, *old)
+        assert refused.returncode == 2
+        assert new in refused.stderr
+    shown = call(path, "--set", "steps=7", "--show")
     assert shown.returncode == 0
     assert "steps: 7" in shown.stdout
     network = {"num_layers": 2, "width": 32, "num_sub_fields": 6, "num_heads": 2}
     network |= {"knn_space": "compatibility", "extra_channels": ["compatibility"]}
-    learnt = call(path, "--overfit", "--quiet", f"network={json.dumps(network)}")
+    learnt = call(path, "--overfit", "--quiet", "--set", f"network={json.dumps(network)}")
     assert learnt.returncode == 0, learnt.stderr
     assert "F1" in learnt.stdout

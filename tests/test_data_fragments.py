@@ -248,7 +248,9 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["data", "fragments", str(tmp_path / "frames"), str(tmp_path / "out"), "--count", "3"]
     assert run(geomoe3d, "geomoe3d", arguments) == 2
     assert "--intrinsics" in capsys.readouterr().err
-    arguments += ["--intrinsics", "140,140,79.5,59.5", "--voxel", "0.02", "--whole"]
+    assert run(geomoe3d, "geomoe3d", [*arguments, "--voxel", "0.02"]) == 2
+    assert "--voxel is now --voxel-size" in capsys.readouterr().err
+    arguments += ["--intrinsics", "140,140,79.5,59.5", "--voxel-size", "0.02", "--whole"]
     assert run(geomoe3d, "geomoe3d", arguments) == 0
     assert "2 fragments" in capsys.readouterr().out
     assert run(geomoe3d, "geomoe3d", ["data", "check", str(tmp_path / "out")]) == 0

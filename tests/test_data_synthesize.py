@@ -176,7 +176,8 @@ def test_command_writes_report_and_contact_sheet(tmp_path: Path, capsys: pytest.
 
     out = tmp_path / "set"
     settings = ["fragments_per_scene=2", "frames_per_fragment=2", "fusion_voxel=0.03", "min_points=500"]
-    arguments = ["data", "synthesize", str(out), "--scenes", "1", "--seed", "2", *settings]
+    arguments = ["data", "synthesize", str(out), "--scenes", "1", "--seed", "2"]
+    arguments += [word for setting in settings for word in ("--set", setting)]
     assert run(geomoe3d, "geomoe3d", arguments) == 0
     text = capsys.readouterr().out
     assert "scenes: 1" in text
@@ -184,8 +185,10 @@ def test_command_writes_report_and_contact_sheet(tmp_path: Path, capsys: pytest.
     with Image.open(out / "contact.png") as picture:
         assert picture.width > 500
     assert run(geomoe3d, "geomoe3d", arguments) == 0
-    assert run(geomoe3d, "geomoe3d", [*arguments, "sensor.farr=3"]) == 2
+    assert run(geomoe3d, "geomoe3d", [*arguments, "--set", "sensor.farr=3"]) == 2
     assert "sensor.far" in capsys.readouterr().err
+    assert run(geomoe3d, "geomoe3d", [*arguments, "min_points=9"]) == 2
+    assert "--set min_points=9" in capsys.readouterr().err
 
 
 def test_settings_are_checked() -> None:

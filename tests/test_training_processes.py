@@ -30,7 +30,7 @@ def test_killed_at_any_moment_and_started_again_gives_the_same_run(tmp_path: Pat
             "geomoe3d.cli.main",
             "train",
             str(path),
-            "--out",
+            "--output",
             str(folder),
             "--quiet",
         ]
@@ -107,7 +107,7 @@ def test_torchrun_trains_and_resumes(tmp_path: Path) -> None:
     path = write_yaml(tmp_path / "c.yaml", {**TREE, "steps": 4, "validation": {"every": 2, "num_pairs": 2}})
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m",
-        "geomoe3d.cli.main", "train", str(path), "--out", str(tmp_path / "run"), "--quiet",
+        "geomoe3d.cli.main", "train", str(path), "--output", str(tmp_path / "run"), "--quiet",
     ]  # fmt: skip
     for _ in range(2):
         done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)

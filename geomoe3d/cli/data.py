@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
+from geomoe3d.cli.errors import BAD_INPUT, HELP, refuse_bare_settings, renamed, traceback_option
 
 if TYPE_CHECKING:
     from geomoe3d.data.check import CheckReport
@@ -72,7 +72,7 @@ def _print(report: CheckReport) -> None:
 @click.argument("frames", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--count", default=50, show_default=True, help="Frames fused into one fragment.")
-@click.option("--voxel", default=0.006, show_default=True, help="Edge of the fusion grid, metres.")
+@click.option("--voxel-size", default=0.006, show_default=True, help="Edge of the fusion grid, metres.")
 @click.option("--max-depth", default=6.0, show_default=True, help="Depth beyond it is not used, metres.")
 @click.option(
     "--whole", is_flag=True, help="Keep what lies outside the cube of 3 m to which 3DMatch cut its fragments."
@@ -88,12 +88,13 @@ def _print(report: CheckReport) -> None:
     multiple=True,
     help="Depth value that means none (default: 0 and 65535); repeatable.",
 )
+@renamed("--voxel", "--voxel-size")
 @traceback_option
 def fragments(
     frames: str,
     out: str,
     count: int,
-    voxel: float,
+    voxel_size: float,
     max_depth: float,
     whole: bool,
     grid: float | None,
@@ -126,8 +127,8 @@ def fragments(
             out,
             frames_per_fragment=count,
             settings=FusionSettings(
-                voxel_size=voxel,
-                truncation=5 * voxel,
+                voxel_size=voxel_size,
+                truncation=5 * voxel_size,
                 max_depth=max_depth,
                 volume=None if whole else THREEDMATCH_VOLUME,
             ),
@@ -155,7 +156,8 @@ def _intrinsics(text: str) -> FloatArray:
 
 @command.command(context_settings=HELP)
 @click.argument("out", type=click.Path())
-@click.argument("assignments", nargs=-1, metavar="[KEY=VALUE]...")
+@click.argument("bare", nargs=-1, metavar="")
+@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One setting; repeatable.")
 @click.option("--scenes", required=True, type=click.IntRange(min=1), help="Scenes of the set.")
 @click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
 @click.option(
@@ -170,6 +172,7 @@ def _intrinsics(text: str) -> FloatArray:
 @traceback_option
 def synthesize(
     out: str,
+    bare: tuple[str, ...],
     assignments: tuple[str, ...],
     scenes: int,
     workers: int,
@@ -181,10 +184,10 @@ def synthesize(
 ) -> None:
     """Generate furnished rooms and record fragments in them, into the folder OUT.
 
-    recorder=scanner takes laser scans instead, recorder=orbit views of single bodies. Rooms come from
-    simple solids alone unless --models or --mesh give more. Same seed, settings and material: same bytes,
-    whatever the number of workers. Started again, an interrupted run goes on. OUT gets scene-NNNNN folders
-    (cloud_bin_N.ply, gt.log), report.md and contact.png.
+    --set recorder=scanner takes laser scans instead, --set recorder=orbit views of single bodies. Rooms are
+    made of simple solids alone unless --models or --mesh give more. Same seed, settings and material: same
+    bytes, whatever the number of workers. Started again, an interrupted run goes on. OUT gets folders
+    scene-NNNNN (cloud_bin_N.ply, gt.log), report.md and contact.png.
     """
     from pathlib import Path
 
@@ -196,6 +199,7 @@ def synthesize(
     from geomoe3d.data.synthesize import scene_name
     from geomoe3d.data.synthesize import synthesize as make
 
+    refuse_bare_settings(bare)
     tree = set_keys(read_yaml(config) if config else {}, list(assignments))
     settings = build_config(SynthesisSettings, tree, config or "settings")
     if show:

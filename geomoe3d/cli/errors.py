@@ -95,6 +95,23 @@ def _explain(error: Exception, shown: bool) -> int:
     return FAULT
 
 
+def renamed(old: str, new: str) -> Callable[[F], F]:
+    """Gives a verb the old name of an option, whose use is an error that names the new one."""
+
+    def refuse(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+        if value is not None:
+            raise click.UsageError(f"{old} is now {new}", context)
+
+    # Without a value too: what the old name took does not matter.
+    return click.option(old, hidden=True, expose_value=False, is_flag=False, flag_value="", callback=refuse)
+
+
+def refuse_bare_settings(words: tuple[str, ...]) -> None:
+    """Where settings were once given without ``--set``: an error that says how they are given now."""
+    if words:
+        raise click.UsageError(f"write --set {words[0]}, not {words[0]} alone")
+
+
 def traceback_option(function: F) -> F:
     """Gives a verb the option ``--traceback``."""
 

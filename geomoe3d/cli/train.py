@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, INTERRUPTED, NOT_SURE, traceback_option
+from geomoe3d.cli.errors import (
+    HELP,
+    INTERRUPTED,
+    NOT_SURE,
+    refuse_bare_settings,
+    renamed,
+    traceback_option,
+)
 
 if TYPE_CHECKING:
     from geomoe3d.training.config import TrainConfig
@@ -17,36 +24,37 @@ if TYPE_CHECKING:
 
 @click.command(context_settings=HELP)
 @click.argument("config", type=click.Path())
-@click.argument("assignments", nargs=-1, metavar="[KEY=VALUE]...")
-@click.option("--out", type=click.Path(), help="Run folder (default: runs/ and the name of CONFIG).")
+@click.argument("bare", nargs=-1, metavar="")
+@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One setting; repeatable.")
+@click.option("--output", metavar="FOLDER", help="Run folder. [runs/ and the name of CONFIG]")
 @click.option("--new", is_flag=True, help="Refuse to continue a run that is there.")
-@click.option("--fresh", is_flag=True, hidden=True)
 @click.option("--overfit", is_flag=True, help="Overfit one batch (sanity check); writes nothing.")
 @click.option("--show", is_flag=True, help="Print the complete configuration and stop.")
 @click.option("--quiet", is_flag=True, help="Print nothing but the summary.")
+@renamed("--out", "--output")
+@renamed("--fresh", "--new")
 @traceback_option
 @click.pass_context
 def command(
     context: click.Context,
     config: str,
+    bare: tuple[str, ...],
     assignments: tuple[str, ...],
-    out: str | None,
+    output: str | None,
     new: bool,
-    fresh: bool,
     overfit: bool,
     show: bool,
     quiet: bool,
 ) -> None:
     """Train the network that CONFIG (a YAML file, see configs/train) describes.
 
-    KEY=VALUE changes a setting, e.g. steps=2000 network.num_layers=4 data.train=SHARDS. Started again with
-    the same folder, a run goes on from its last checkpoint, exactly. Under torchrun it uses every process.
+    --set changes a setting, e.g. --set steps=2000 --set data.train=SHARDS. Started again with the same
+    folder, a run continues from its last checkpoint, exactly. Under torchrun it uses every process.
     The folder gets logs (CSV, TensorBoard), checkpoints, weights.safetensors with its card, curves.png.
     """
     from geomoe3d.training.config import load_train_config
 
-    if fresh:  # elsewhere it removes what is there
-        raise click.UsageError("--fresh is now --new, which refuses to continue a run that is there")
+    refuse_bare_settings(bare)
     settings = load_train_config(config, list(assignments))
     if show:
         import yaml
@@ -55,7 +63,9 @@ def command(
     elif overfit:
         context.exit(_overfit(settings, quiet))
     else:
-        context.exit(_train(settings, Path(out) if out else Path("runs") / Path(config).stem, new, quiet))
+        context.exit(
+            _train(settings, Path(output) if output else Path("runs") / Path(config).stem, new, quiet)
+        )
 
 
 def _train(settings: TrainConfig, folder: Path, new: bool, quiet: bool) -> int:

@@ -35,9 +35,9 @@ def test_config_prints_what_register_reads(tmp_path, scan_files, fake_registrar,
     assert call("config", "--set", "seed=9") == 0
     text = capsys.readouterr().out
     path = tmp_path / "config.yaml"
-    assert call("config", "--set", "seed=9", "--out", path) == 0
+    assert call("config", "--set", "seed=9", "--output", path) == 0
     assert path.read_text() == text
-    assert call("config", "--out", path) == 2  # it exists
+    assert call("config", "--output", path) == 2  # it exists
     assert path.read_text() == text
     assert call("register", *scan_files, "--config", path) == 0
     assert fake_registrar.asked[0][2] == RegistrationConfig(seed=9)

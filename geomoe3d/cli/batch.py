@@ -16,24 +16,30 @@ _SHOWN = 20
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red", "error": "red"}
 
 
-@click.command(context_settings=HELP, short_help="Register many pairs, resumably, on one machine or more.")
+@click.command(context_settings=HELP, short_help="Register a table of pairs, on one machine or a cluster.")
 @click.argument("pairs", metavar="PAIRS.csv")
 @click.argument("out", metavar="OUT")
 @click.option(
     "--workers",
     type=click.IntRange(1),
     metavar="N",
-    help="Local processes. [as many as cores and memory allow]",
+    help="Parallel processes on this machine. [as many as cores and memory allow]",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask scheduler instead.")
-@click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid, in the clouds' unit. [chosen]")
-@click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
-@click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
-@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead.")
+@click.option("--voxel-size", metavar="LENGTH", help="Edge of a voxel, in the clouds' unit. [chosen]")
+@click.option("--seed", metavar="N", help="Random seed: the same seed, the same answers. [0]")
+@click.option("--config", "config_file", metavar="FILE", help="Configuration (YAML); see `geomoe3d config`.")
+@click.option(
+    "--set",
+    "assignments",
+    metavar="KEY=VALUE",
+    multiple=True,
+    help="One value of the configuration; repeatable.",
+)
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
 @click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
-@click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier batch.")
-@click.option("--retry", is_flag=True, help="Try pairs again that could not be registered.")
+@click.option("--fresh", is_flag=True, help="Delete the results of an earlier batch in OUT first.")
+@click.option("--retry", is_flag=True, help="Try the pairs again that could not be registered.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
 @click.option("--no-cache", is_flag=True, help="Cache no features: compute them anew for every pair.")
 @click.option("--quiet", is_flag=True, help="No progress and no table.")
@@ -57,12 +63,12 @@ def command(
     no_cache: bool,
     quiet: bool,
 ) -> None:
-    """Register every pair of PAIRS.csv into the folder OUT.
+    """Register every pair listed in PAIRS.csv and write the results to the folder OUT.
 
-    The table has the columns source and target and may have id and a first guess: initial (a transform
-    file) or T00 to T33. Relative paths are relative to the table. Killed and started again, it goes on with
-    what is missing. A file that cannot be read fails its own pairs alone. Exit code 0 where every pair is
-    ok, 3 where some are not, 2 for unusable input.
+    The table needs the columns source and target. Optional columns: id, and an initial transform, either
+    as a file (initial) or as 16 numbers (T00 to T33). Relative paths start at the folder of the table. An
+    interrupted batch continues when it is started again. A file that cannot be read affects its own pairs
+    only. Exit code 0 if every pair is ok, 3 if not, 2 for unusable input.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.config import load_config

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import click
 
-from geomoe3d.cli.errors import HELP, traceback_option
+from geomoe3d.cli.errors import HELP, renamed, traceback_option
 
 
 @click.command(context_settings=HELP, short_help="Print the complete configuration, commented.")
 @click.option("--config", "source", metavar="FILE", help="Start from this YAML file.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="Change one value.")
-@click.option("--out", metavar="FILE", help="Write to this file instead of the screen.")
+@click.option("--output", metavar="FILE", help="Write to this file instead of the screen.")
 @click.option("--force", is_flag=True, help="Replace a file that exists.")
+@renamed("--out", "--output")
 @traceback_option
-def command(source: str | None, assignments: tuple[str, ...], out: str | None, force: bool) -> None:
+def command(source: str | None, assignments: tuple[str, ...], output: str | None, force: bool) -> None:
     """Print the complete configuration of `register` as commented YAML.
 
     Edit it and pass it on with `register --config FILE`; keys left out keep their defaults.
@@ -23,8 +24,8 @@ def command(source: str | None, assignments: tuple[str, ...], out: str | None, f
     from geomoe3d.runtime.files import write_text
 
     text = commented_yaml(load_config(source, list(assignments)))
-    if out is None:
+    if output is None:
         click.echo(text, nl=False)
         return
-    write_text(out, text, force=force)
-    click.echo(out)
+    write_text(output, text, force=force)
+    click.echo(output)

@@ -25,7 +25,7 @@ _min_overlap = click.option(
 
 @click.group(context_settings=HELP)
 def command() -> None:
-    """Look through, make and prepare training and test data."""
+    """Check, generate and prepare training and test data."""
 
 
 @command.command(context_settings=HELP)
@@ -35,7 +35,7 @@ def command() -> None:
 @traceback_option
 @click.pass_context
 def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None:
-    """Say which layout ROOT has, what it holds against what was published, and name every broken file.
+    """Say which layout ROOT has, compare it with what was published, and name every broken file.
 
     Exit code 0 when every listed pair can be used, else 2.
     """
@@ -71,16 +71,24 @@ def _print(report: CheckReport) -> None:
 @command.command(context_settings=HELP)
 @click.argument("frames", type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option("--count", default=50, show_default=True, help="Frames fused into one fragment.")
+@click.option("--count", default=50, show_default=True, help="Number of frames fused into one fragment.")
 @click.option("--voxel-size", default=0.006, show_default=True, help="Edge of the fusion grid, metres.")
-@click.option("--max-depth", default=6.0, show_default=True, help="Depth beyond it is not used, metres.")
+@click.option("--max-depth", default=6.0, show_default=True, help="Greater depths are not used, metres.")
 @click.option(
-    "--whole", is_flag=True, help="Keep what lies outside the cube of 3 m to which 3DMatch cut its fragments."
+    "--whole", is_flag=True, help="Keep points outside the 3 m cube to which 3DMatch cut its fragments."
 )
 @click.option("--grid", type=float, help="Keep one point per cell of this edge, metres (default: all).")
 @_min_overlap
-@click.option("--convention", type=click.Choice(("7scenes", "tum", "plain")), help="Default: look at FRAMES.")
-@click.option("--intrinsics", metavar="FX,FY,CX,CY", help="Pixels (default: the folder's file).")
+@click.option(
+    "--convention",
+    type=click.Choice(("7scenes", "tum", "plain")),
+    help="Default: recognised by the files in FRAMES.",
+)
+@click.option(
+    "--intrinsics",
+    metavar="FX,FY,CX,CY",
+    help="Focal lengths and centre, pixels (default: the folder's file).",
+)
 @click.option("--depth-unit", type=float, help="Depth values per metre (default: 1000, TUM 5000).")
 @click.option(
     "--invalid",
@@ -241,7 +249,7 @@ def synthesize(
     default=0.05,
     show_default=True,
     type=click.FloatRange(min=0, min_open=True),
-    help="Grid of the described points, in the fragments' unit.",
+    help="Edge of a voxel, in the unit of the fragments.",
 )
 @click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
 @traceback_option
@@ -257,10 +265,11 @@ def features(
     voxel_size: float,
     workers: int,
 ) -> None:
-    """Describe the fragments of ROOT once, into the shards OUT that training reads.
+    """Compute the features of the fragments of ROOT once and store them in OUT, where training reads them.
 
     ROOT is any folder that 'geomoe3d data check' knows. Started again, it goes on; a shard that no longer
-    fits its fragments or settings is refused. Train with data.train=OUT. Exit code 2 when OUT got no shard.
+    fits its fragments or settings is refused. Train with --set data.train=OUT. Exit code 2 when OUT got no
+    shard.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.data.describe import describe_collection
@@ -299,10 +308,11 @@ def features(
 @traceback_option
 @click.pass_context
 def motions(context: click.Context, features: str, out: str, pairs: int, seed: int, workers: int) -> None:
-    """Draw pairs from the shards FEATURES and keep them with the motions that consensus proposes, in OUT.
+    """Draw pairs from the shards FEATURES and store them with the transforms that consensus proposes in OUT.
 
-    FEATURES is what 'geomoe3d data features' made. A network that judges motions trains on OUT
-    (configs/train/motions.yaml, data.train=OUT). Started again, it goes on. Exit code 2 when a shard fails.
+    FEATURES is what 'geomoe3d data features' made. A network that scores transforms trains on OUT
+    (configs/train/motions.yaml, --set data.train=OUT). Started again, it goes on. Exit code 2 when a shard
+    fails.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.training.motions import propose_motions

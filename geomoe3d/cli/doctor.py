@@ -11,12 +11,12 @@ from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
 _COLORS = {"ok": "green", "missing": "yellow", "broken": "red"}
 
 
-@click.command(context_settings=HELP, short_help="Say what this machine lacks, and what mends it.")
+@click.command(context_settings=HELP, short_help="Check the installation and say how to repair it.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @traceback_option
 @click.pass_context
 def command(context: click.Context, as_json: bool) -> None:
-    """Say what this machine lacks, and the command that mends it.
+    """Check the installation and print the commands that repair it.
 
     Exit code 0 when everything required is there, else 2.
     """

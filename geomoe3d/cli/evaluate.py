@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @click.group(context_settings=HELP)
 def command() -> None:
-    """Measure filters, estimators and whole systems on benchmarks, in the field's own terms."""
+    """Measure registration methods on benchmarks: recall, errors, confidence, time."""
 
 
 def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -31,7 +31,7 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 metavar="NAME",
                 multiple=True,
                 required=True,
-                help="See `evaluate methods`; FILE.py:FUNCTION is your own. Repeatable.",
+                help="A name from `evaluate methods`, or FILE.py:FUNCTION. Repeatable.",
             ),
             click.option(
                 "--benchmark",
@@ -49,13 +49,13 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 show_default=True,
                 help="Input: 1k or all (fixed correspondences), or clouds (end to end).",
             ),
-            click.option("--every", default=1, show_default=True, help="Every n-th pair only."),
+            click.option("--every", default=1, show_default=True, help="Use every n-th pair only."),
             click.option(
                 "--unrelated",
                 "num_unrelated",
                 default=200,
                 show_default=True,
-                help="Pairs of the benchmark unrelated.",
+                help="Number of pairs of the benchmark unrelated.",
             ),
             click.option(
                 "--set",
@@ -65,14 +65,16 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 help="Configuration of the method geomoe3d; repeatable.",
             ),
             click.option("--label", help="Name of the run, if there is one method. [the method's]"),
-            click.option("--data", "root", metavar="FOLDER", help="Of the benchmarks. [GEOMOE3D_DATA]"),
+            click.option(
+                "--data", "root", metavar="FOLDER", help="Folder of the benchmarks. [GEOMOE3D_DATA]"
+            ),
             click.option(
                 "--workers",
                 default=1,
                 show_default=True,
                 help="Processes; with two or more, a method that crashes loses one pair only.",
             ),
-            click.option("--seed", default=0, show_default=True, help="Same seed, same predictions."),
+            click.option("--seed", default=0, show_default=True, help="Random seed of the methods."),
             click.option("--fresh", is_flag=True, help="Remove the stored answers of these runs first."),
         )
     ):

@@ -16,44 +16,53 @@ if TYPE_CHECKING:
 _SHOWN = 20
 
 
-@click.command(context_settings=HELP, short_help="Place many scans in one model.")
+@click.command(context_settings=HELP, short_help="Register many scans into one model.")
 @click.argument("inputs", metavar="SCANS... OUT", nargs=-1, required=True)
 @click.option(
     "--pairs",
     metavar="WHICH",
     default="auto",
-    help=f"all, similar, or auto: all for up to {ALL_PAIRS_UP_TO} scans.",
+    help=f"Pairs to register: all, similar, or auto (all for up to {ALL_PAIRS_UP_TO} scans). [auto]",
 )
 @click.option(
     "--neighbors",
     type=click.IntRange(1),
     default=NEIGHBORS,
     metavar="N",
-    help=f"Pairs proposed per scan and round. [{NEIGHBORS}]",
+    help=f"Pairs tried per scan and round. [{NEIGHBORS}]",
 )
 @click.option(
-    "--model-voxel-size", type=float, metavar="LENGTH", help="Of the merged cloud. [that of the scans]"
+    "--model-voxel-size",
+    type=float,
+    metavar="LENGTH",
+    help="Edge of a voxel of the merged cloud. [that of the scans]",
 )
 @click.option(
     "--rounds",
     type=click.IntRange(0),
     default=MOST_ROUNDS,
     metavar="N",
-    help=f"Of further pairs, where scans are loose. [{MOST_ROUNDS}]",
+    help=f"Rounds of further pairs for scans that are not connected yet. [{MOST_ROUNDS}]",
 )
 @click.option(
     "--workers",
     type=click.IntRange(1),
     metavar="N",
-    help="Local processes. [as many as cores and memory allow]",
+    help="Parallel processes on this machine. [as many as cores and memory allow]",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask scheduler instead.")
-@click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid of all scans. [chosen]")
-@click.option("--seed", metavar="N", help="Same seed, same answers. [0]")
-@click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
-@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
-@click.option("--page/--no-page", default=True, help="Write OUT/page.html or not. [write it]")
-@click.option("--fresh", is_flag=True, help="Forget what OUT holds of an earlier model.")
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead.")
+@click.option("--voxel-size", metavar="LENGTH", help="Edge of a voxel, for all scans. [chosen]")
+@click.option("--seed", metavar="N", help="Random seed: the same seed, the same answers. [0]")
+@click.option("--config", "config_file", metavar="FILE", help="Configuration (YAML); see `geomoe3d config`.")
+@click.option(
+    "--set",
+    "assignments",
+    metavar="KEY=VALUE",
+    multiple=True,
+    help="One value of the configuration; repeatable.",
+)
+@click.option("--page/--no-page", default=True, help="Write OUT/page.html, or do not. [--page]")
+@click.option("--fresh", is_flag=True, help="Delete the earlier model in OUT first.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @traceback_option
@@ -76,11 +85,11 @@ def command(
     cache: str | None,
     quiet: bool,
 ) -> None:
-    """Place all SCANS (files, or folders of them) in one model, written to the folder OUT.
+    """Register all SCANS (files, or folders of them) into one model, written to the folder OUT.
 
-    Scans that nothing sure connects stay in groups of their own; a scan that cannot be placed is listed with
-    the reason. Called again with more scans, all pairs of earlier calls are reused. Exit code 0 where all
-    scans stand in one group, 3 where not, 2 for unusable input.
+    Scans without a reliable connection form separate groups; a scan that cannot be placed is listed with
+    the reason. Called again with more scans, it reuses all pairs that were registered before. Exit code 0 if
+    all scans are in one group, 3 if not, 2 for unusable input.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.config import load_config

@@ -9,14 +9,16 @@ from geomoe3d.cli.errors import HELP, traceback_option
 
 @click.command(context_settings=HELP)
 @click.argument("folder", default="sample", metavar="[FOLDER]")
-@click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another pair.")
+@click.option(
+    "--seed", type=int, default=0, show_default=True, help="Random seed; another seed gives another pair."
+)
 @click.option("--force", is_flag=True, help="Replace files that exist.")
 @traceback_option
 def command(folder: str, seed: int, force: bool) -> None:
-    """Make a pair of scans to try things on.
+    """Write a pair of example scans.
 
     Two views of one generated room, as a depth camera sees it, go into FOLDER (default: sample) as
-    source.ply and target.ply, with the true motion in T_target_source.txt. Metres.
+    source.ply and target.ply, with the true transform in T_target_source.txt. Metres.
     """
     from geomoe3d.cli.progress import stage_display, stdout_to_stderr
     from geomoe3d.data.sample import write_sample_pair

@@ -10,6 +10,7 @@ import pytest
 from cloud_files import UTM, cloud, fails, small_cloud
 
 from geomoe3d.clouds.io import load_points, save_points
+from geomoe3d.clouds.loading import read_raw
 
 
 def test_las_stores_nearly_black_colors_unambiguously(tmp_path: Path) -> None:
@@ -56,3 +57,44 @@ def test_truncated_and_lying_las(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(load_points(path).file_points, small_cloud()[:60], atol=1e-6)
     path.write_bytes(b"hello world" * 100)
     fails(path, "no LAS file")
+
+
+def test_copc_is_the_laz_that_it_is(tmp_path: Path) -> None:
+    """Chunks of different size, one per octree node, a record at the file's begin and one behind its points."""
+    laspy, lazrs = pytest.importorskip("laspy"), pytest.importorskip("lazrs")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = [0.001] * 3, UTM
+    las = laspy.LasData(header)
+    las.X, las.Y, las.Z = np.random.default_rng(0).integers(-(10**6), 10**6, (300, 3)).T
+    las.intensity = np.arange(1, 301)
+    las.write(tmp_path / "plain.las")
+    plain = (tmp_path / "plain.las").read_bytes()
+    rows = plain[struct.unpack("<I", plain[96:100])[0] :]
+    record = lazrs.LazVlr.new_for_compression(6, 0, True)
+    vlrs = b"".join(
+        struct.pack("<H16sHH32s", 0, user, number, len(data), b"") + data
+        for user, number, data in (
+            (b"copc", 1, bytes(160)),
+            (b"laszip encoded", 22204, record.record_data()),
+        )
+    )
+    first = 375 + len(vlrs)
+    with (tmp_path / "a.copc.laz").open("w+b") as handle:
+        handle.write(bytes(first))
+        packer = lazrs.LasZipCompressor(handle, record)
+        for begin, end in ((0, 50), (50, 110), (110, 300)):
+            packer.compress_many(np.frombuffer(rows[30 * begin : 30 * end], np.uint8))
+            packer.finish_current_chunk()
+        packer.done()
+        handle.seek(0, 2)
+        behind = handle.tell()
+        handle.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, 32, b"") + bytes(32))
+        head = bytearray(plain[:375])
+        head[96:100], head[100:104] = struct.pack("<I", first), struct.pack("<I", 2)
+        head[104] |= 128
+        head[235:247] = struct.pack("<QI", behind, 1)
+        handle.seek(0)
+        handle.write(bytes(head) + vlrs)
+    cloud = read_raw(tmp_path / "a.copc.laz")
+    np.testing.assert_array_equal(cloud.points, read_raw(tmp_path / "plain.las").points)
+    np.testing.assert_array_equal(cloud.fields["intensity"], np.arange(1, 301))

@@ -40,16 +40,16 @@ def test_summary_tells_everything_and_is_plain_where_nobody_sees_colours(scan_fi
     assert "\x1b" not in printed.out
     assert printed.err == ""  # no progress where nobody looks
     first = printed.out.splitlines()[0]
-    assert first == "ok: the transform can be relied on (confidence 0.97)"
+    assert first == "ok: the transform is reliable (confidence 0.97)"
     for part in (
         "Mostly one plane.",
-        "56% of the source lies on the target",
-        "1,234 of 4,321 correspondences agree within 0.11",
+        "56% of the source",
+        "1,234 of 4,321 correspondences within 0.11",
         "0.055 (chosen from the clouds",
         "source.xyz: 81,234 points in, 4,900 voxel points used; "
         "dropped 12 non-finite, 7 duplicates, 3 isolated voxels",
         "target.xyz: 71,000 points in, 4,100 voxel points used; nothing dropped",
-        "scores 0.83 of this one, 92.1 deg and 1.25 away",
+        "runner-up   83 % of the score, differs by 92.1 deg and 1.25",
         "load 0.25, match 1.50, total 1.75",
         "maps SOURCE (source.xyz) into TARGET (target.xyz): p_target = R p_source + t",
         "583394.123456789",

@@ -13,10 +13,10 @@ from geomoe3d.types import FloatArray
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}
 _MEANING = {
-    "ok": "the transform can be relied on",
-    "low_confidence": "the transform may well be wrong",
-    "ambiguous": "another motion fits about as well",
-    "failed": "no transform can be relied on",
+    "ok": "the transform is reliable",
+    "low_confidence": "the transform may be wrong",
+    "ambiguous": "a different transform fits about as well",
+    "failed": "no reliable transform was found",
 }
 
 
@@ -73,23 +73,23 @@ def _found(result: RegistrationResult) -> list[str]:
     if not math.isfinite(result.voxel_size):
         return []
     return [
-        _row("overlap", f"{result.overlap:.0%} of the source lies on the target"),
+        _row("overlap", f"{result.overlap:.0%} of the source"),
         _row("inliers", _inliers(result)),
-        _row("alternative", _alternative(result)),
+        _row("runner-up", _alternative(result)),
         _row("voxel size", f"{result.voxel_size:.6g}{_chosen(result)}"),
     ]
 
 
 def _inliers(result: RegistrationResult) -> str:
     return (
-        f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences agree "
-        f"within {result.inlier_threshold:.6g}"
+        f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences within "
+        f"{result.inlier_threshold:.6g}"
     )
 
 
 def _chosen(result: RegistrationResult) -> str:
     given = result.config.get("voxel_size") is not None
-    return "" if given else " (chosen from the clouds; --voxel-size sets it)"
+    return "" if given else " (chosen from the clouds; set it with --voxel-size)"
 
 
 def _cloud(cloud: CloudReport) -> str:
@@ -109,8 +109,8 @@ def _cloud(cloud: CloudReport) -> str:
 def _alternative(result: RegistrationResult) -> str:
     other = result.alternative
     if other is None:
-        return "no clearly different motion comes near"
+        return "none that differs clearly comes near"
     return (
-        f"another motion scores {other.relative_score:.2f} of this one, "
-        f"{other.rotation_difference_deg:.1f} deg and {other.translation_difference:.4g} away"
+        f"{100 * other.relative_score:.0f} % of the score, "
+        f"differs by {other.rotation_difference_deg:.1f} deg and {other.translation_difference:.4g}"
     )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from pose_graphs import edge, graph
+from scipy.spatial.transform import Rotation
 
-from geomoe3d.geometry.se3 import inverse
+from geomoe3d.geometry.se3 import inverse, make_transform
+from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.pose_graph import optimise
 
 
@@ -16,3 +18,14 @@ def test_the_pose_graph_keeps_its_reference_and_spreads_the_error_of_a_loop():
     assert np.abs(found[0] - start[0]).max() < 1e-9
     T = truth[0] @ inverse(found[0])
     assert max(np.abs(T @ found[k] - truth[k]).max() for k in truth) < 1e-3
+
+
+def test_an_edge_is_weighed_in_the_frame_in_which_it_was_measured():
+    turns = [np.eye(3), *(Rotation.from_rotvec(np.pi / 2 * np.eye(3)[k]).as_matrix() for k in (1, 2))]
+    truth = {k: make_transform(turns[1] @ turns[k], np.array([1.0, 0.3, 0.0]) * k) for k in range(3)}
+    edges = [Edge(j, i, inverse(truth[i]) @ truth[j], 0.9, 1000 * np.eye(6)) for i, j in ((0, 1), (1, 2))]
+    off = inverse(truth[0]) @ truth[2]
+    off[0, 3] += 0.05  # along the target's x, which this pair does not hold at all
+    edges.append(Edge(2, 0, off, 0.9, 1000 * np.diag([1, 1, 1, 1e-6, 1, 1])))
+    found = optimise(dict(truth), edges, 0.5)
+    assert max(np.abs(found[k] - truth[k]).max() for k in truth) < 1e-6

@@ -133,6 +133,20 @@ def predicted_motion(source: int, target: int, poses: dict[int, FloatArray]) -> 
     return T
 
 
+def source_information(edge: Edge) -> FloatArray:
+    """(6, 6) information about a small motion [rotation, translation] on the right of the edge's transform.
+
+    Pose graphs weigh there: g2o, GTSAM, and Open3D 0.20, though it builds its matrices from the target's
+    points. A small motion x on the right of T equals Ad(T) x on its left.
+    """
+    R, t = edge.T_target_source[:3, :3], edge.T_target_source[:3, 3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[3:, :3] = cross_matrix(t) @ R
+    moved: FloatArray = adjoint.T @ edge.information @ adjoint
+    return moved
+
+
 def _about_origin(information: FloatArray, center: FloatArray) -> FloatArray:
     """Information about ``center`` as information about the origin of the same frame.
 

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geomoe3d.geometry.se3 import cross_matrix
-from geomoe3d.multiway.edges import Edge
+from geomoe3d.multiway.edges import Edge, source_information
 from geomoe3d.types import FloatArray
 
 
@@ -50,17 +49,13 @@ def g2o_text(poses: dict[int, FloatArray], edges: Sequence[Edge]) -> str:
 def right_information(edge: Edge) -> FloatArray:
     """(6, 6) information of an edge as g2o takes it: order [translation, half turn], motion on the right.
 
-    A small motion x on the right of T equals Ad(T) x on its left.
+    g2o counts a turn by the vector part of a quaternion, half of it. GTSAM reads the same file in full turns,
+    so that rotations weigh four times what is meant there.
     """
-    R, t = edge.T_target_source[:3, :3], edge.T_target_source[:3, 3]
-    adjoint = np.zeros((6, 6))  # order [rotation, translation]
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[3:, :3] = cross_matrix(t) @ R
-    adjoint[:, :3] *= 2.0  # the vector part of a quaternion is half the turn
+    scale = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
     order = [3, 4, 5, 0, 1, 2]
-    information = adjoint.T @ edge.information @ adjoint
-    ordered: FloatArray = information[np.ix_(order, order)]
-    return ordered
+    information: FloatArray = (scale @ source_information(edge) @ scale)[np.ix_(order, order)]
+    return information
 
 
 def quaternion(R: FloatArray) -> FloatArray:

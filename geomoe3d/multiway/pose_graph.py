@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
-from geomoe3d.multiway.edges import Edge
+from geomoe3d.multiway.edges import Edge, source_information
 from geomoe3d.types import FloatArray
 
 _LOOP_PREFERENCE = 2.0
@@ -45,7 +45,7 @@ def optimise(poses: dict[int, FloatArray], edges: Sequence[Edge], tolerance: flo
                 number[edge.source],
                 number[edge.target],
                 edge.T_target_source,
-                edge.information * edge.confidence,
+                source_information(edge) * edge.confidence,
                 uncertain=id(edge) not in tree,
             )
         )

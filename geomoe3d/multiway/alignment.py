@@ -24,6 +24,8 @@ from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 _NUM_POINTS = 500  # of each scan, asked about each neighbour
 _LEAST_OVERLAP = 0.1
 _REACHES = (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5)  # voxels; one step each
+_GROUP_REACHES = (5.0, 4.0, 3.0, 3.0, 2.0, 2.0)  # of two groups that are laid on each other
+_MOST_PAIRS = 30  # of scans, asked for two groups
 _NEIGHBORS_AGAIN = 5  # the step before which it is asked again who overlaps whom
 _SCALE = 1 / 3  # of the reach: a gap this large counts a quarter
 _LEAST_COSINE = 0.7
@@ -97,6 +99,50 @@ def align_scans(
     # All may have drifted together; everything is told from where the first scan was.
     back = poses[scans[0]] @ inverse(current[scans[0]])
     return {k: back @ T for k, T in current.items()}
+
+
+@single_blas_thread()
+def align_groups(
+    a: Mapping[int, FloatArray],
+    b: Mapping[int, FloatArray],
+    T_a_b: FloatArray,
+    surfaces: Mapping[int, Surface],
+    overlaps: Overlaps,
+    voxel_size: float,
+) -> FloatArray:
+    """The motion T_a_b (4, 4) at which two groups, each rigid, lie in each other's surfaces best.
+
+    Args:
+        a, b: poses T_group_scan of their scans.
+        T_a_b: start, right to about three voxels.
+        surfaces, overlaps, voxel_size: as in `align_scans`.
+    """
+    from scipy.spatial import cKDTree
+
+    shared = [
+        (overlaps.of(j, i, inverse(a[i]) @ T_a_b @ b[j]), i, j) for i in a for j in b if i in surfaces and j in surfaces
+    ]
+    pairs = [(i, j) for o, i, j in sorted(shared, reverse=True)[:_MOST_PAIRS] if o >= _LEAST_OVERLAP]
+    trees = {i: cKDTree(surfaces[i].points) for i in {i for i, _ in pairs}}
+    rng = np.random.default_rng(0)
+    chosen = {j: rng.permutation(len(surfaces[j].points))[:_NUM_POINTS] for j in sorted({j for _, j in pairs})}
+    T = T_a_b
+    for reach in _GROUP_REACHES if pairs else ():
+        A, slope = np.zeros((6, 6)), np.zeros(6)
+        about = np.mean([transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for _, j in pairs], axis=0)
+        lever = _lever(about, 1.0)
+        for i, j in pairs:
+            one, two = _pull(
+                surfaces[j], surfaces[i], chosen[j], trees[i], T @ b[j], a[i], reach * voxel_size
+            )  # fmt: skip
+            A += lever.T @ one @ lever
+            slope += lever.T @ two
+        damping = _DAMPING * float(np.trace(A)) / 6
+        if damping <= 0:
+            break
+        step = np.linalg.solve(A + damping * np.eye(6), slope)
+        T = _moved(T, step[:3], step[3:], about)
+    return T
 
 
 class _System:

@@ -7,6 +7,7 @@ square distance by which they move the points of the source scan.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from geomoe3d.geometry.se3 import cross_matrix, inverse, rotation_angle_deg, shi
 from geomoe3d.types import FloatArray
 
 _MOST_LOG_ODDS = 7.0
+_UNRELATED = 1.0  # the confidence is that of pairs of which most overlap
 _LEAST_OBSERVABILITY = 1e-3  # directions weaker than this share of the strongest are held this much
 
 
@@ -57,6 +59,7 @@ class Edge:
             perturbation; scaled so that its translation part counts matched points.
         looseness: standard deviation of the source's sensor in the target, cloud units, if the gaps between
             the surfaces were independent from point to point; they are not, see `GroupingRules`.
+        evidence: log-odds that triangles of edges add, see `geomoe3d.multiway.cycles`.
     """
 
     source: int
@@ -65,15 +68,21 @@ class Edge:
     confidence: float
     information: FloatArray
     looseness: float = 0.0
+    evidence: float = 0.0
+
+    @property
+    def prior(self) -> float:
+        """Log-odds of the confidence among pairs of which most share nothing, at most 7: none is certain."""
+        odds = np.clip(self.confidence, 1e-9, 1 - 1e-9)
+        return float(min(np.log(odds / (1 - odds)) - _UNRELATED, _MOST_LOG_ODDS))
 
     @property
     def worth(self) -> float:
-        """Log-odds of the confidence, at most 7: one edge alone never counts as certain."""
-        odds = np.clip(self.confidence, 1e-9, 1 - 1e-9)
-        return float(min(np.log(odds / (1 - odds)), _MOST_LOG_ODDS))
+        """Log-odds that the edge is right, by its confidence and by the triangles that it is part of."""
+        return self.prior + self.evidence
 
 
-def edge_of(outcome: Outcome, source: int, target: int, shapes: list[Shape]) -> Edge | None:
+def edge_of(outcome: Outcome, source: int, target: int, shapes: Sequence[Shape] | Mapping[int, Shape]) -> Edge | None:
     """The edge of a finished pair, or None where it holds no motion."""
     result = outcome.result
     if result is None or not has_transform(result) or not np.isfinite(result.information_matrix).all():
@@ -91,6 +100,23 @@ def edge_of(outcome: Outcome, source: int, target: int, shapes: list[Shape]) -> 
     radius_squared = max(float(np.trace(shapes[source].spread)), 1e-12)
     information += floor * np.diag([radius_squared] * 3 + [1.0] * 3)
     return Edge(source, target, T, result.confidence, information, looseness)
+
+
+def differences(
+    motions: FloatArray, others: FloatArray, shapes: Sequence[Shape]
+) -> tuple[FloatArray, FloatArray]:
+    """How far motions (K, 4, 4) and others of the same K scans are apart.
+
+    Returns:
+        (K,) root mean square distance between the images of the scan's points, cloud units, and (K,) angle
+        between the rotations, degrees.
+    """
+    D = motions - others
+    shift = np.einsum("kij,kj->ki", D[:, :3, :3], np.stack([s.center for s in shapes])) + D[:, :3, 3]
+    spreads = np.stack([s.spread for s in shapes])
+    squares = (shift**2).sum(1) + np.einsum("kij,kjl,kil->k", D[:, :3, :3], spreads, D[:, :3, :3])
+    cosine = (np.einsum("kij,kij->k", motions[:, :3, :3], others[:, :3, :3]) - 1) / 2
+    return np.sqrt(np.maximum(squares, 0.0)), np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def displacement(T_a: FloatArray, T_b: FloatArray, shape: Shape) -> float:

@@ -1,26 +1,32 @@
-"""From edges of which some are wrong to groups of scans with poses, by growing what is sure.
+"""From edges of which most may be wrong to groups of scans with poses, by growing what is sure.
 
-Two groups are joined by the motion for which most evidence speaks: every edge between them votes, edges that
-agree add up, and those that contradict count against it. One very sure edge, or two agreeing ones, are
-needed; where two motions compete, the groups stay apart. Pairs that would overlap well by the motion, were
-registered and do not say so, speak against it. What has been joined is never torn by weaker edges:
-these are found to disagree with the poses and rejected. Cost: some milliseconds per joined scan.
+Two groups are joined by the motion for which most speaks: edges between them that agree add up, the best other
+motion is taken off, and so is what the scans themselves contradict: points of one group where sensors of the
+other saw through. The surest joint is made first. What has been joined is never torn by weaker edges: these are
+found to disagree with the poses and rejected. Cost: some milliseconds per joined scan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from geomoe3d.geometry.se3 import inverse
-from geomoe3d.multiway.edges import Edge, Shape, agrees, expected_error, predicted_motion
-from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.types import BoolArray, FloatArray
 
-_MOST_ROUNDS = 6
+_MOST_MOTIONS = 3  # of two groups that are weighed against each other
+_MOST_PROPOSALS = 60  # edges between two groups whose motions are looked at, the surest
+_MOST_WORTH = 8.0
+_RIVAL = 0.25  # of the worth of the best: a motion that the scans are asked about again
+
+Poses = dict[int, FloatArray]
+Witness = Callable[[Mapping[int, FloatArray], Mapping[int, FloatArray], FloatArray], tuple[FloatArray, float]]
+"""Asked of two groups (poses of each) and a motion T_a_b (4, 4): the motion as the surfaces have it, and the
+log-odds by which the scans speak for it (negative: against)."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +34,6 @@ class GroupingRules:
     """When groups are joined and edges kept.
 
     Attributes:
-        least_worth: edges with a lower log-odds have no voice (0: a confidence of 0.5).
-        joined_worth: log-odds that the winning motion must collect (6: one confidence of 0.9975, or several).
         tolerance: largest displacement of motions that agree when groups are joined, cloud units.
         turn_deg: their largest turn.
         near_tolerance: largest displacement from the poses of an edge over which they are optimised.
@@ -39,9 +43,9 @@ class GroupingRules:
         kept_error: largest `expected_error` of a kept edge, cloud units.
         correlation: real errors of the sensor's place over what independent gaps would give: neighbouring
             points err alike. In four scenes of depth cameras half lay above 14 to 21, a tenth above 26 to 45.
+        least_worth: edges with lower log-odds have no voice.
+        joined_worth: log-odds that the winning motion must have left.
         further_share: of the log-odds of all supporters but the surest, since they are not independent.
-        silent_overlap: a pair that overlaps this much should have been registered rightly: 94 % of them are.
-        silent_worth: log-odds by which such a pair counts against a motion that it does not support.
     """
 
     tolerance: float
@@ -53,170 +57,215 @@ class GroupingRules:
     kept_turn_deg: float = 3.0
     correlation: float = 20.0
     further_share: float = 0.5
-    silent_overlap: float = 0.5
-    silent_worth: float = 2.0
     least_worth: float = 0.0
-    joined_worth: float = 6.0
+    joined_worth: float = 2.0
 
 
 @dataclass
 class Group:
     """Scans with poses T_group_scan (4, 4), local coordinates, and the edges that hold them together."""
 
-    poses: dict[int, FloatArray]
+    poses: Poses
     edges: list[Edge] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Vote:
-    """What speaks for one motion T_a_b between two groups.
+@dataclass
+class Motion:
+    """One way to join two groups.
 
     Attributes:
         T_a_b: (4, 4) group b in the frame of group a.
         supporters: edges that agree with it.
-        worth: their log-odds, not counted in full, minus those of the edges against it.
+        worth: what they bring together; once ``weighed``, without what the scans contradict.
+        weighed: whether the scans have been asked.
     """
 
     T_a_b: FloatArray
-    supporters: tuple[Edge, ...]
+    supporters: list[Edge]
     worth: float
-
-    def enough(self, rules: GroupingRules) -> bool:
-        """Whether the groups may be joined by it."""
-        return self.worth >= rules.joined_worth
+    weighed: bool = False
 
 
-def group_scans(
-    shapes: Sequence[Shape],
-    edges: Sequence[Edge],
-    rules: GroupingRules,
-    tried: Collection[tuple[int, int]] = (),
-    overlaps: Overlaps | None = None,
-    start: Sequence[Group] | None = None,
-) -> list[Group]:
-    """Groups of scans, the largest first; a scan that nothing sure ties to another is a group of its own.
+class Growth:
+    """Groups that grow together.
 
     Args:
+        groups: to begin with; no scan is in two of them.
+        edges: of all registered pairs, with what cycles say of them.
         shapes: of all scans.
-        edges: of all registered pairs.
         rules: thresholds.
-        tried: pairs (smaller, larger number) that were registered, whatever came of it.
-        overlaps: predicts how much two scans overlap; None takes no account of pairs that are silent.
-        start: groups to begin with, every scan in one of them; None: every scan by itself.
+        witness: what the scans say of a motion between two groups; None: they are not asked.
     """
-    shapes = list(shapes)
-    voices = [edge for edge in edges if edge.worth > rules.least_worth]
-    alone = [Group({k: np.eye(4)}) for k in range(len(shapes))]
-    groups = {min(group.poses): group for group in (alone if start is None else start)}
-    member = [0] * len(shapes)
-    for number, group in groups.items():
-        for scan in group.poses:
-            member[scan] = number
-    votes: dict[tuple[int, int], Vote | None] = {}
-    heard: set[tuple[int, int]] = set()  # votes from which silent pairs have been taken off
-    between: dict[tuple[int, int], list[Edge]] = {}
-    for edge in voices:
-        if member[edge.source] != member[edge.target]:
-            between.setdefault(_pair(member[edge.source], member[edge.target]), []).append(edge)
-    while True:
-        for key, crossing in between.items():
-            if key not in votes:
-                votes[key] = best_vote(groups[key[0]], groups[key[1]], crossing, shapes, rules)
-        sure = [(vote.worth, key) for key, vote in votes.items() if vote is not None and vote.enough(rules)]
-        if not sure:
-            break
-        _, (a, b) = max(sure, key=lambda item: (item[0], (-item[1][0], -item[1][1])))
-        vote = votes[a, b]
-        assert vote is not None
-        if overlaps is not None and (a, b) not in heard:
-            heard.add((a, b))
-            silent = _num_silent(groups[a], groups[b], vote, tried, overlaps, rules)
-            votes[a, b] = replace(vote, worth=vote.worth - rules.silent_worth * silent)
-            continue
-        groups[a] = _join(groups[a], groups.pop(b), vote, shapes, rules)
-        for scan in groups[a].poses:
-            member[scan] = a
-        votes = {key: v for key, v in votes.items() if a not in key and b not in key}
-        heard = {key for key in heard if a not in key and b not in key}
-        between = {}
-        for edge in voices:
-            one, other = member[edge.source], member[edge.target]
-            if one != other:
-                between.setdefault(_pair(one, other), []).append(edge)
-    return sorted(groups.values(), key=lambda group: (-len(group.poses), min(group.poses)))
 
+    def __init__(
+        self,
+        groups: Sequence[Group],
+        edges: Sequence[Edge],
+        shapes: Sequence[Shape],
+        rules: GroupingRules,
+        witness: Witness | None = None,
+    ) -> None:
+        self.groups = {min(group.poses): group for group in groups}
+        self._shapes, self._rules, self._witness = shapes, rules, witness
+        home = {scan: number for number, group in self.groups.items() for scan in group.poses}
+        self._between: dict[tuple[int, int], list[Edge]] = {}
+        for edge in edges:
+            a, b = home[edge.source], home[edge.target]
+            if a != b and edge.worth > rules.least_worth:
+                self._between.setdefault((min(a, b), max(a, b)), []).append(edge)
+        self._ways: dict[tuple[int, int], list[Motion]] = {}
 
-def _num_silent(
-    a: Group,
-    b: Group,
-    vote: Vote,
-    tried: Collection[tuple[int, int]],
-    overlaps: Overlaps,
-    rules: GroupingRules,
-) -> int:
-    """Registered pairs across two groups that would overlap well by a motion but do not support it."""
-    speaking = {_pair(edge.source, edge.target) for edge in vote.supporters}
-    count = 0
-    for i in a.poses:
-        for j in b.poses:
-            pair = _pair(i, j)
-            if pair not in tried or pair in speaking:
-                continue
-            T = inverse(a.poses[i]) @ vote.T_a_b @ b.poses[j]
-            count += overlaps.of(j, i, T) >= rules.silent_overlap and (
-                overlaps.of(i, j, inverse(T)) >= rules.silent_overlap
+    def run(self) -> list[Group]:
+        """Join while anything is sure; the groups, the largest first."""
+        while True:
+            for pair in self._between.keys() - self._ways.keys():
+                self._ways[pair] = self._motions(*pair)
+            worth, pair = max(
+                ((lead(ways), (-a, -b)) for (a, b), ways in self._ways.items()), default=(0.0, (0, 0))
             )
-    return count
+            if worth < self._rules.joined_worth:
+                return largest_first(self.groups.values())
+            a, b = -pair[0], -pair[1]
+            if all(way.weighed for way in self._ways[a, b]):
+                self._join(a, b)
+            else:
+                self._weigh(a, b)
+
+    def rivals(self) -> list[Motion]:
+        """Of two groups: the ways to join them, weighed, the best first; none where only one is worth a look."""
+        for pair in self._between:
+            ways = self._motions(*pair)
+            if len(ways) > 1 and ways[1].worth > _RIVAL * ways[0].worth:
+                self._ways[pair] = ways
+                self._weigh(*pair)
+                return self._ways[pair]
+        return []
+
+    def _motions(self, a: int, b: int) -> list[Motion]:
+        """The ways to join two groups for which most speaks, no two alike, the best first."""
+        one, other = self.groups[a], self.groups[b]
+        edges = sorted(self._between[a, b], key=lambda e: (-e.worth, e.source, e.target))
+        worth = np.array([min(edge.worth, _MOST_WORTH) for edge in edges])
+        motions = np.stack([_between_groups(edge, one, other) for edge in edges])
+        agreeing = self._agreements(motions, edges, other)
+        free = np.ones(len(edges), dtype=np.bool_)
+        found: list[Motion] = []
+        while len(found) < _MOST_MOTIONS and free.any():
+            voices = np.where(agreeing & free, worth, 0.0)
+            surest = voices.max(axis=1)
+            total = surest + self._rules.further_share * (voices.sum(axis=1) - surest)
+            best = int(np.where(free[: len(total)], total, -1.0).argmax())
+            if not free[best]:
+                break
+            mine = np.flatnonzero(agreeing[best] & free)
+            found.append(Motion(motions[best], [edges[k] for k in mine], float(total[best])))
+            free[mine] = False
+        return found
+
+    def _agreements(self, motions: FloatArray, edges: list[Edge], b: Group) -> BoolArray:
+        """(m, n) True where motion m of the first ones moves the scan of edge n as that edge does."""
+        ends = [edge.source if edge.source in b.poses else edge.target for edge in edges]
+        poses = np.stack([b.poses[scan] for scan in ends])
+        rows, count = min(len(edges), _MOST_PROPOSALS), len(edges)
+        moved = (motions[:rows, None] @ poses[None]).reshape(-1, 4, 4)
+        own = np.tile(motions @ poses, (rows, 1, 1))
+        shift, turn = differences(moved, own, [self._shapes[scan] for scan in ends] * rows)
+        alike = (shift < self._rules.tolerance) & (turn < self._rules.turn_deg)
+        agreeing: BoolArray = alike.reshape(rows, count) | np.eye(rows, count, dtype=np.bool_)
+        return agreeing
+
+    def _weigh(self, a: int, b: int) -> None:
+        """Take off every motion what the scans contradict."""
+        for way in self._ways[a, b]:
+            if self._witness is not None and not way.weighed:
+                way.T_a_b, told = self._witness(self.groups[a].poses, self.groups[b].poses, way.T_a_b)
+                way.worth += told
+            way.weighed = True
+        self._ways[a, b] = self._merged(self._ways[a, b], b)
+
+    def _merged(self, ways: list[Motion], b: int) -> list[Motion]:
+        """The ways, the best first, those that the surfaces drew together as one."""
+        merged: list[Motion] = []
+        for way in sorted(ways, key=lambda way: -way.worth):
+            same = next((one for one in merged if self._alike(one, way, b)), None)
+            if same is None:
+                merged.append(way)
+            elif way.worth > 0:
+                same.worth += self._rules.further_share * way.worth
+                same.supporters = [*same.supporters, *way.supporters]
+        return merged
+
+    def _alike(self, one: Motion, other: Motion, b: int) -> bool:
+        poses = self.groups[b].poses
+        ends = [edge.source if edge.source in poses else edge.target for edge in other.supporters]
+        there = np.stack([poses[scan] for scan in ends])
+        shift, turn = differences(one.T_a_b @ there, other.T_a_b @ there, [self._shapes[k] for k in ends])
+        return bool((shift < self._rules.tolerance).all() and (turn < self._rules.turn_deg).all())
+
+    def _join(self, a: int, b: int) -> None:
+        """Group b becomes part of group a; poses are optimised where there are loops to close."""
+        way, one, other = self._ways[a, b][0], self.groups[a], self.groups.pop(b)
+        poses = {**one.poses, **{scan: way.T_a_b @ T for scan, T in other.poses.items()}}
+        edges = [*one.edges, *other.edges, *way.supporters]
+        grown = len(other.poses) > 1 or _octave(len(poses)) > _octave(len(one.poses))
+        if grown and len(edges) >= len(poses):
+            poses = optimise(poses, edges, self._rules.tolerance)
+        self.groups[a] = Group(poses, edges)
+        crossing, self._between = self._between, {}
+        for pair, some in crossing.items():
+            c, d = sorted(a if number == b else number for number in pair)
+            if c != d:
+                self._between.setdefault((c, d), []).extend(some)
+        self._ways = {pair: ways for pair, ways in self._ways.items() if not {a, b} & set(pair)}
 
 
-def best_vote(
-    a: Group, b: Group, crossing: Sequence[Edge], shapes: list[Shape], rules: GroupingRules
-) -> Vote | None:
-    """The motion T_a_b for which the crossing edges speak most, with what speaks against it taken off.
+def reconsidered(
+    group: Group,
+    edges: Sequence[Edge],
+    shapes: Sequence[Shape],
+    rules: GroupingRules,
+    witness: Witness,
+) -> list[Group]:
+    """The group with every scan that has a rival place put where most speaks for it now, or let go.
 
-    Every edge proposes its own motion. Against it counts the most that the other edges bring together for one
-    other motion: wrong edges scatter, right ones gather.
-    """
-    if not crossing:
-        return None
-    motions = np.stack([_between_groups(edge, a, b) for edge in crossing])
-    agreeing = _agreements(motions, [_end_in(edge, b) for edge in crossing], b, shapes, rules)
-    worth = np.array([edge.worth for edge in crossing])
-    outside = np.where(agreeing, 0.0, worth)  # row: what does not speak for the row's motion
-    against = np.where(~agreeing, outside @ agreeing.T, 0.0).max(axis=1, initial=0.0)
-    # Agreeing edges are no independent witnesses: scans taken one after the other are deceived alike.
-    surest = (agreeing * worth).max(axis=1)
-    total = surest + rules.further_share * (agreeing @ worth - surest) - against
-    best = int(total.argmax())
-    supporters = tuple(edge for edge, yes in zip(crossing, agreeing[best], strict=True) if yes)
-    return Vote(motions[best], supporters, float(total[best]))
-
-
-def _agreements(
-    motions: FloatArray, ends: list[int], b: Group, shapes: list[Shape], rules: GroupingRules
-) -> BoolArray:
-    """(n, n) True where motion k (rows) moves the scan of edge e (columns) as edge e itself does.
+    A scan that joined early was weighed against few others; now the whole model can be asked.
 
     Args:
-        motions: (n, 4, 4) T_a_b by every edge.
-        ends: the scan of every edge that lies in ``b``.
+        group: from `Growth`.
+        edges, shapes, rules, witness: as `Growth` takes them.
+
+    Returns:
+        The group, and scans by themselves for which no place leads clearly enough.
     """
-    poses = np.stack([b.poses[scan] for scan in ends])
-    R = poses[:, :3, :3]
-    centers = np.einsum("eij,ej->ei", R, np.stack([shapes[k].center for k in ends])) + poses[:, :3, 3]
-    spreads = R @ np.stack([shapes[k].spread for k in ends]) @ R.transpose(0, 2, 1)
-    D = motions[:, None] - motions[None]
-    shift = np.einsum("keij,ej->kei", D[..., :3, :3], centers) + D[..., :3, 3]
-    squares = (shift**2).sum(-1) + np.einsum("keij,ejl,keil->ke", D[..., :3, :3], spreads, D[..., :3, :3])
-    cosine = (np.einsum("kij,eij->ke", motions[:, :3, :3], motions[:, :3, :3]) - 1) / 2
-    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    agreeing: BoolArray = (squares < rules.tolerance**2) & (turn < rules.turn_deg)
-    np.fill_diagonal(agreeing, True)
-    return agreeing
+    released: list[Group] = []
+    edges = [replace(e, evidence=0.0) for e in edges]  # what triangles say is what the model says
+    for scan in sorted(group.poses) if len(group.poses) > 2 else ():
+        rest = {k: T for k, T in group.poses.items() if k != scan}
+        mine = [e for e in edges if scan in (e.source, e.target) and {e.source, e.target} <= group.poses.keys()]
+        ways = Growth([Group(rest), Group({scan: np.eye(4)})], mine, shapes, rules, witness).rivals()
+        if len(ways) < 2:
+            continue
+        found = ways[0].T_a_b if min(rest) < scan else inverse(ways[0].T_a_b)
+        shift, turn = differences(group.poses[scan][None], found[None], [shapes[scan]])
+        if shift[0] < 2 * rules.tolerance and turn[0] < 2 * rules.turn_deg:
+            continue
+        others = [e for e in group.edges if scan not in (e.source, e.target)]
+        if lead(ways) >= rules.joined_worth:
+            group = Group({**rest, scan: found}, [*others, *ways[0].supporters])
+        else:
+            group = Group(rest, others)
+            released.append(Group({scan: np.eye(4)}))
+    return [group, *released]
 
 
-def _end_in(edge: Edge, group: Group) -> int:
-    return edge.source if edge.source in group.poses else edge.target
+def lead(ways: Sequence[Motion]) -> float:
+    """What speaks for the first motion, without what speaks for the second."""
+    return ways[0].worth - (max(ways[1].worth, 0.0) if len(ways) > 1 else 0.0)
+
+
+def largest_first(groups: Sequence[Group]) -> list[Group]:
+    """The groups by their number of scans; of equals the one with the first scan."""
+    return sorted(groups, key=lambda group: (-len(group.poses), min(group.poses)))
 
 
 def _between_groups(edge: Edge, a: Group, b: Group) -> FloatArray:
@@ -229,119 +278,6 @@ def _between_groups(edge: Edge, a: Group, b: Group) -> FloatArray:
     return T
 
 
-def _join(a: Group, b: Group, vote: Vote, shapes: list[Shape], rules: GroupingRules) -> Group:
-    """One group, its poses optimised over all edges that agree."""
-    poses = {**a.poses, **{scan: vote.T_a_b @ pose for scan, pose in b.poses.items()}}
-    edges = [*a.edges, *b.edges, *vote.supporters]
-    grown = len(b.poses) > 1 or _octave(len(poses)) > _octave(len(a.poses))
-    if grown and len(edges) >= len(poses):  # there is a loop to close
-        poses = optimise(poses, edges, rules.tolerance)
-    return Group(poses, edges)
-
-
-def settle(
-    group: Group,
-    edges: Sequence[Edge],
-    shapes: Sequence[Shape],
-    rules: GroupingRules,
-    align: Callable[[dict[int, FloatArray]], dict[int, FloatArray]] | None = None,
-) -> list[Group]:
-    """The group held by the edges that agree closely with its final poses.
-
-    Poses are optimised over the edges near them until none comes or goes, and then laid on each other by
-    their surfaces. An edge is kept where it agrees with what came of that: surfaces that all agree show the
-    error of a single pair, which the pose graph would have spread among its neighbours.
-
-    Args:
-        group: from `group_scans`.
-        edges: of all registered pairs.
-        shapes: of all scans.
-        rules: thresholds.
-        align: poses to better poses, by the surfaces; None leaves them as the edges give them.
-
-    Returns:
-        One group, or several where only edges that do not agree closely held them together.
-    """
-    inside = [e for e in edges if e.source in group.poses and e.target in group.poses]
-    inside = [e for e in inside if e.worth > rules.least_worth]
-    poses, kept = group.poses, group.edges
-    for _ in range(_MOST_ROUNDS):
-        near = _agreeing(inside, poses, shapes, rules.near_tolerance, rules.near_turn_deg)
-        if {id(e) for e in near} == {id(e) for e in kept}:
-            break
-        kept = near
-        parts = connected_parts(poses, kept)
-        if len(parts) > 1:
-            return _settled_apart(poses, parts, kept, shapes, rules, align)
-        poses = optimise(poses, kept, rules.tolerance)
-    if align is not None and len(poses) > 1:
-        poses = align(poses)
-    kept = _agreeing(inside, poses, shapes, rules.kept_tolerance, rules.kept_turn_deg)
-    kept = [
-        e for e in kept if expected_error(e, poses, shapes[e.source], rules.correlation) < rules.kept_error
-    ]
-    parts = connected_parts(poses, kept)
-    if len(parts) > 1:
-        return _settled_apart(poses, parts, kept, shapes, rules, align)
-    return [Group(poses, kept)]
-
-
-def _settled_apart(
-    poses: dict[int, FloatArray],
-    parts: list[list[int]],
-    edges: Sequence[Edge],
-    shapes: Sequence[Shape],
-    rules: GroupingRules,
-    align: Callable[[dict[int, FloatArray]], dict[int, FloatArray]] | None,
-) -> list[Group]:
-    """Every part of a group settled by itself: what let go of it may have bent it."""
-    groups = [Group({k: poses[k] for k in part}) for part in parts]
-    return [piece for part in groups for piece in settle(part, edges, shapes, rules, align)]
-
-
-def _agreeing(
-    edges: Sequence[Edge],
-    poses: dict[int, FloatArray],
-    shapes: Sequence[Shape],
-    tolerance: float,
-    turn_deg: float,
-) -> list[Edge]:
-    """The edges that say what the poses say."""
-    return [
-        edge
-        for edge in edges
-        if agrees(
-            predicted_motion(edge.source, edge.target, poses),
-            edge.T_target_source,
-            shapes[edge.source],
-            tolerance,
-            turn_deg,
-        )
-    ]
-
-
-def connected_parts(scans: Iterable[int], edges: Sequence[Edge]) -> list[list[int]]:
-    """The scans in parts that edges connect, each sorted, the largest first."""
-    parent = {scan: scan for scan in scans}
-
-    def root(scan: int) -> int:
-        while parent[scan] != scan:
-            scan = parent[scan]
-        return scan
-
-    for edge in edges:
-        if edge.source in parent and edge.target in parent:
-            parent[root(edge.source)] = root(edge.target)
-    parts: dict[int, list[int]] = {}
-    for scan in sorted(parent):
-        parts.setdefault(root(scan), []).append(scan)
-    return sorted(parts.values(), key=lambda part: (-len(part), part[0]))
-
-
 def _octave(count: int) -> int:
     """Rises by one with every quarter more: optimising after each single scan would cost its square."""
     return int(np.log(count) / np.log(1.25))
-
-
-def _pair(a: int, b: int) -> tuple[int, int]:
-    return (a, b) if a < b else (b, a)

@@ -108,12 +108,19 @@ def register_scans(
     groups = survey.group()
     for count in range(rounds):
         more = survey.further_pairs(groups, neighbors, closing=count == 0)
-        if not more:
+        if more:
+            clock("register further pairs")
+            survey.register(more)
+            clock("group scans")
+            groups = survey.group()
+        maps = survey.map_pairs(groups)
+        if maps:
+            clock("register local maps")
+            survey.register_maps(maps, groups)
+            clock("group scans")
+            groups = survey.group()
+        if not more and not maps:
             break
-        clock("register further pairs")
-        survey.register(more)
-        clock("group scans")
-        groups = survey.group()
     clock("write the model")
     model = describe_model(survey, folder, groups)
     write_model(model, merged_voxel_size)

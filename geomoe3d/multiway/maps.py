@@ -1,0 +1,117 @@
+"""Local maps: a scan with those of its group that overlap it most, so that groups meet which no pair of scans joins.
+
+Place: after grouping, between groups that are still apart. Four scans show more than one, and what they share
+with a scan of another group is larger. A map is written as a file and registered like a scan; its anchor is
+the scan in whose frame it lies, so that an edge between maps is one between their anchors.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.multiway.alignment import Surface
+from geomoe3d.multiway.edges import Edge
+from geomoe3d.multiway.grouping import Group, Poses
+from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.types import FloatArray
+
+MAPS_FOLDER = "maps"
+_SCANS = 4  # of a map; of eight, what is not shared drowns what is
+_PER_TWO_GROUPS = 6
+_MOST = 40  # pairs of maps in one round
+
+
+@dataclass(frozen=True)
+class MapPair:
+    """Two maps of two groups that may show the same place.
+
+    Attributes:
+        source, target: numbers of their anchors, the larger first.
+        members: the scans of both maps, the anchor first.
+        T_target_source: (4, 4) between the anchors' local frames as a doubtful edge has it, or None.
+    """
+
+    source: int
+    target: int
+    members: tuple[tuple[int, ...], tuple[int, ...]]
+    T_target_source: FloatArray | None
+
+
+def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]:
+    """The scans of the map about a scan: itself, and those of its group that overlap it most."""
+    shared = {
+        k: overlaps.of(k, anchor, inverse(poses[anchor]) @ T) for k, T in poses.items() if k != anchor
+    }
+    nearest = sorted((k for k in shared if shared[k] > 0), key=lambda k: (-shared[k], k))
+    return anchor, *nearest[: _SCANS - 1]
+
+
+def map_pairs(
+    groups: Sequence[Group], edges: Sequence[Edge], similarity: FloatArray, overlaps: Overlaps
+) -> list[MapPair]:
+    """Pairs of maps of different groups: about the surest edges between the groups, and where scans look alike.
+
+    Args:
+        groups: the largest first; of two single scans no map is made.
+        edges: of all registered pairs, with what cycles say of them.
+        similarity: (K, K) of the scans.
+        overlaps: of all scans.
+    """
+    found: list[MapPair] = []
+    known: dict[int, tuple[int, ...]] = {}
+    for a, b in combinations(groups, 2):
+        if len(a.poses) + len(b.poses) < 3 or len(found) >= _MOST:
+            continue
+        poses = {**a.poses, **b.poses}
+        crossing = [e for e in edges if (e.source in a.poses) != (e.target in a.poses)]
+        crossing = [e for e in crossing if e.source in poses and e.target in poses]
+        crossing.sort(key=lambda e: (-e.worth, e.source, e.target))
+        alike = sorted(
+            ((i, j) for i in a.poses for j in b.poses if np.isfinite(similarity[i, j])),
+            key=lambda pair: (-similarity[pair], pair),
+        )
+        wanted: list[tuple[int, int, FloatArray | None]] = [(e.source, e.target, e.T_target_source) for e in crossing]
+        half = _PER_TWO_GROUPS // 2
+        chosen: list[MapPair] = []
+        for lot, limit in ((wanted, half), ([(j, i, None) for i, j in alike], _PER_TWO_GROUPS)):
+            for source, target, T in lot:
+                if len(chosen) >= limit:
+                    break
+                if any({source, target} <= set(sum(pair.members, ())) for pair in chosen):
+                    continue  # a map of these was chosen already
+                if source < target:
+                    source, target, T = target, source, None if T is None else inverse(T)
+                for scan in (source, target):
+                    if scan not in known:
+                        known[scan] = members_of(scan, a.poses if scan in a.poses else b.poses, overlaps)
+                chosen.append(MapPair(source, target, (known[source], known[target]), T))
+        found += [pair for pair in chosen if max(map(len, pair.members)) > 1]
+    return found[:_MOST]
+
+
+def write_map(
+    folder: Path, members: Sequence[int], poses: Poses, surfaces: Mapping[int, Surface], sensor: FloatArray
+) -> Path:
+    """A map as a file of points about its anchor's sensor, named by what it holds; one that is there stays.
+
+    Args:
+        folder: made if missing.
+        members: its scans, the anchor first.
+        poses: T_group_scan of them.
+        surfaces: their voxel points.
+        sensor: (3,) of the anchor, local coordinates.
+    """
+    to_anchor = inverse(poses[members[0]])
+    points = np.concatenate([transform_points(to_anchor @ poses[k], surfaces[k].points) for k in members]) - sensor
+    path = folder / f"{hashlib.sha256(points.tobytes()).hexdigest()[:24]}.npy"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(path, points)
+    return path

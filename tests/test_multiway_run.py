@@ -297,7 +297,8 @@ def test_beginning_anew_removes_what_the_model_left_and_nothing_else(scanned_roo
     model = register_scans(scans, copied, config=CONFIG, fresh=True, page=False)
     assert model.num_pairs == len(list(read_journal(copied / "pairs" / JOURNAL_FILE))) == 1
     group = {f"group1.{suffix}" for suffix in ("tum.txt", "kitti.txt", "g2o", "ply")}
-    assert {path.name for path in copied.iterdir()} == {"poses.json", "pairs", "notes.txt", *group}
+    tables = {"scans.csv", "edges.csv", "matrices"}
+    assert {path.name for path in copied.iterdir()} == {"poses.json", "pairs", "notes.txt", *group, *tables}
     assert (copied / "pairs" / "notes.txt").read_text() == "mine"
 
 
@@ -390,12 +391,16 @@ def test_a_folder_of_other_scans_is_refused_and_one_of_notes_is_not(scanned_room
         (tmp_path / name).unlink()
 
 
-def test_why_a_scan_is_not_placed_names_the_confidence_that_counts():
+def test_why_a_scan_is_not_placed_names_its_likely_pairs():
     scans = [Scan(name, f"/{name}.ply") for name in "abc"]
-    edges = {pair: Edge(pair[1], pair[0], np.eye(4), 0.9, np.eye(6)) for pair in ((0, 2), (1, 2))}
-    rules = GroupingRules(1.0, 1.0, 1.0, 1.0, least_worth=float(np.log(3)))
-    survey = SimpleNamespace(unusable={}, edges=edges, outcomes=edges, scans=scans, rules=rules)
-    assert "its 2 pairs above 0.75 do not agree" in _why_unplaced(survey, 2)
+    edges = [Edge(2, k, np.eye(4), confidence, np.eye(6)) for k, confidence in ((0, 0.9), (1, 0.8))]
+    survey = SimpleNamespace(
+        unusable={}, outcomes=[(0, 2), (1, 2)], scans=scans, rules=GroupingRules(1.0, 1.0, 1.0, 1.0)
+    )
+    reason = _why_unplaced(survey, edges, 2)
+    assert reason.startswith("its surest of 2 pairs, with 'a', has confidence 0.900")
+    assert "its 2 likely pairs do not agree" in reason
+    assert "nothing agrees with it" in _why_unplaced(survey, edges[:1], 2)
 
 
 def test_files_of_the_users_beside_a_model_stay(scanned_room, tmp_path):

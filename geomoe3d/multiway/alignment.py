@@ -120,16 +120,23 @@ def align_groups(
     from scipy.spatial import cKDTree
 
     shared = [
-        (overlaps.of(j, i, inverse(a[i]) @ T_a_b @ b[j]), i, j) for i in a for j in b if i in surfaces and j in surfaces
+        (overlaps.of(j, i, inverse(a[i]) @ T_a_b @ b[j]), i, j)
+        for i in a
+        for j in b
+        if i in surfaces and j in surfaces
     ]
     pairs = [(i, j) for o, i, j in sorted(shared, reverse=True)[:_MOST_PAIRS] if o >= _LEAST_OVERLAP]
     trees = {i: cKDTree(surfaces[i].points) for i in {i for i, _ in pairs}}
     rng = np.random.default_rng(0)
-    chosen = {j: rng.permutation(len(surfaces[j].points))[:_NUM_POINTS] for j in sorted({j for _, j in pairs})}
+    chosen = {
+        j: rng.permutation(len(surfaces[j].points))[:_NUM_POINTS] for j in sorted({j for _, j in pairs})
+    }
     T = T_a_b
     for reach in _GROUP_REACHES if pairs else ():
         A, slope = np.zeros((6, 6)), np.zeros(6)
-        about = np.mean([transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for _, j in pairs], axis=0)
+        about = np.mean(
+            [transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for _, j in pairs], axis=0
+        )
         lever = _lever(about, 1.0)
         for i, j in pairs:
             one, two = _pull(
@@ -140,7 +147,7 @@ def align_groups(
         damping = _DAMPING * float(np.trace(A)) / 6
         if damping <= 0:
             break
-        step = np.linalg.solve(A + damping * np.eye(6), slope)
+        step: FloatArray = np.linalg.solve(A + damping * np.eye(6), slope).astype(np.float64)
         T = _moved(T, step[:3], step[3:], about)
     return T
 

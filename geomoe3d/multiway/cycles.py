@@ -81,7 +81,9 @@ def closes(
         shapes, tolerance, turn_deg: as in `with_cycles`.
     """
     # T_a_b of every edge with a < b, whichever way the pair was registered.
-    motions = np.stack([e.T_target_source if e.target < e.source else inverse(e.T_target_source) for e in edges])
+    motions = np.stack(
+        [e.T_target_source if e.target < e.source else inverse(e.T_target_source) for e in edges]
+    )
     ab, bc, ac = triangles.T
     last = [shapes[max(edges[k].source, edges[k].target)] for k in bc]
     shift, turn = differences(motions[ab] @ motions[bc], motions[ac], last)
@@ -100,7 +102,8 @@ def propagate(prior: FloatArray, triangles: IntArray, closed: BoolArray) -> Floa
     messages = np.zeros(triangles.shape)
 
     def told() -> FloatArray:
-        return _SHARE * np.bincount(triangles.ravel(), messages.ravel(), minlength=len(prior))
+        sums = np.bincount(triangles.ravel(), _SHARE * messages.ravel(), minlength=len(prior))
+        return sums.astype(np.float64)
 
     for _ in range(_ROUNDS):
         # What an edge tells a triangle leaves out what that triangle told it.

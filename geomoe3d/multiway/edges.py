@@ -59,6 +59,8 @@ class Edge:
             perturbation; scaled so that its translation part counts matched points.
         looseness: standard deviation of the source's sensor in the target, cloud units, if the gaps between
             the surfaces were independent from point to point; they are not, see `GroupingRules`.
+        expected: log-odds by what is known beforehand, as that the scans were taken one after the other.
+        of_maps: whether local maps about the scans were registered, not the scans alone.
         evidence: log-odds that triangles of edges add, see `geomoe3d.multiway.cycles`.
     """
 
@@ -69,12 +71,14 @@ class Edge:
     information: FloatArray
     looseness: float = 0.0
     evidence: float = 0.0
+    expected: float = 0.0
+    of_maps: bool = False
 
     @property
     def prior(self) -> float:
         """Log-odds of the confidence among pairs of which most share nothing, at most 7: none is certain."""
         odds = np.clip(self.confidence, 1e-9, 1 - 1e-9)
-        return float(min(np.log(odds / (1 - odds)) - _UNRELATED, _MOST_LOG_ODDS))
+        return float(min(np.log(odds / (1 - odds)) - _UNRELATED + self.expected, _MOST_LOG_ODDS))
 
     @property
     def worth(self) -> float:
@@ -82,7 +86,9 @@ class Edge:
         return self.prior + self.evidence
 
 
-def edge_of(outcome: Outcome, source: int, target: int, shapes: Sequence[Shape] | Mapping[int, Shape]) -> Edge | None:
+def edge_of(
+    outcome: Outcome, source: int, target: int, shapes: Sequence[Shape] | Mapping[int, Shape]
+) -> Edge | None:
     """The edge of a finished pair, or None where it holds no motion."""
     result = outcome.result
     if result is None or not has_transform(result) or not np.isfinite(result.information_matrix).all():

@@ -1,8 +1,8 @@
 """How far a model contradicts itself: points of one scan where another scan's sensor saw through.
 
-Place: asked before two groups are joined, and of a finished group. A single pair that was registered rarely
-contradicts itself, since registration asked the same; all pairs across two groups under one motion do, as soon
-as that motion is wrong. Cost: about 0.1 ms per pair of scans.
+Place: asked before two groups are joined. A single pair that was registered rarely contradicts itself, since
+registration asked the same; all pairs across two groups under one motion do, as soon as that motion is wrong.
+Cost: about 0.1 ms per pair of scans.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """From edges of which most may be wrong to groups of scans with poses, by growing what is sure.
 
-Two groups are joined by the motion for which most speaks: edges between them that agree add up, the best other
-motion is taken off, and so is what the scans themselves contradict: points of one group where sensors of the
-other saw through. The surest joint is made first. What has been joined is never torn by weaker edges: these are
-found to disagree with the poses and rejected. Cost: some milliseconds per joined scan.
+Two groups are joined by the motion for which most speaks: edges between them that agree add up, the best
+other motion is taken off, and so is what the scans themselves contradict, such as points of one group where
+sensors of the other saw through. The surest joint is made first. What has been joined is never torn by weaker edges:
+these are found to disagree with the poses and rejected. Cost: some milliseconds per joined scan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -132,7 +132,7 @@ class Growth:
                 self._weigh(a, b)
 
     def rivals(self) -> list[Motion]:
-        """Of two groups: the ways to join them, weighed, the best first; none where only one is worth a look."""
+        """Of two groups: the ways to join them, weighed, the best first; none if only one is worth a look."""
         for pair in self._between:
             ways = self._motions(*pair)
             if len(ways) > 1 and ways[1].worth > _RIVAL * ways[0].worth:
@@ -241,7 +241,9 @@ def reconsidered(
     edges = [replace(e, evidence=0.0) for e in edges]  # what triangles say is what the model says
     for scan in sorted(group.poses) if len(group.poses) > 2 else ():
         rest = {k: T for k, T in group.poses.items() if k != scan}
-        mine = [e for e in edges if scan in (e.source, e.target) and {e.source, e.target} <= group.poses.keys()]
+        mine = [
+            e for e in edges if scan in (e.source, e.target) and {e.source, e.target} <= group.poses.keys()
+        ]
         ways = Growth([Group(rest), Group({scan: np.eye(4)})], mine, shapes, rules, witness).rivals()
         if len(ways) < 2:
             continue
@@ -259,11 +261,13 @@ def reconsidered(
 
 
 def lead(ways: Sequence[Motion]) -> float:
-    """What speaks for the first motion, without what speaks for the second."""
+    """What speaks for the first motion, without what speaks for the second once the scans have been asked."""
+    if not ways[0].weighed:
+        return ways[0].worth
     return ways[0].worth - (max(ways[1].worth, 0.0) if len(ways) > 1 else 0.0)
 
 
-def largest_first(groups: Sequence[Group]) -> list[Group]:
+def largest_first(groups: Iterable[Group]) -> list[Group]:
     """The groups by their number of scans; of equals the one with the first scan."""
     return sorted(groups, key=lambda group: (-len(group.poses), min(group.poses)))
 

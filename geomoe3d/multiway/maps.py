@@ -1,4 +1,4 @@
-"""Local maps: a scan with those of its group that overlap it most, so that groups meet which no pair of scans joins.
+"""Local maps: a scan with those of its group that overlap it most, for groups that no pair of scans joins.
 
 Place: after grouping, between groups that are still apart. Four scans show more than one, and what they share
 with a scan of another group is larger. A map is written as a file and registered like a scan; its anchor is
@@ -25,7 +25,7 @@ from geomoe3d.types import FloatArray
 MAPS_FOLDER = "maps"
 _SCANS = 4  # of a map; of eight, what is not shared drowns what is
 _PER_TWO_GROUPS = 6
-_MOST = 40  # pairs of maps in one round
+_MOST = 24  # pairs of maps in one round
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,7 @@ class MapPair:
 
 def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]:
     """The scans of the map about a scan: itself, and those of its group that overlap it most."""
-    shared = {
-        k: overlaps.of(k, anchor, inverse(poses[anchor]) @ T) for k, T in poses.items() if k != anchor
-    }
+    shared = {k: overlaps.of(k, anchor, inverse(poses[anchor]) @ T) for k, T in poses.items() if k != anchor}
     nearest = sorted((k for k in shared if shared[k] > 0), key=lambda k: (-shared[k], k))
     return anchor, *nearest[: _SCANS - 1]
 
@@ -56,7 +54,7 @@ def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]
 def map_pairs(
     groups: Sequence[Group], edges: Sequence[Edge], similarity: FloatArray, overlaps: Overlaps
 ) -> list[MapPair]:
-    """Pairs of maps of different groups: about the surest edges between the groups, and where scans look alike.
+    """Pairs of maps of different groups: about the surest edges between them, and where scans look alike.
 
     Args:
         groups: the largest first; of two single scans no map is made.
@@ -77,7 +75,9 @@ def map_pairs(
             ((i, j) for i in a.poses for j in b.poses if np.isfinite(similarity[i, j])),
             key=lambda pair: (-similarity[pair], pair),
         )
-        wanted: list[tuple[int, int, FloatArray | None]] = [(e.source, e.target, e.T_target_source) for e in crossing]
+        wanted: list[tuple[int, int, FloatArray | None]] = [
+            (e.source, e.target, e.T_target_source) for e in crossing
+        ]
         half = _PER_TWO_GROUPS // 2
         chosen: list[MapPair] = []
         for lot, limit in ((wanted, half), ([(j, i, None) for i, j in alike], _PER_TWO_GROUPS)):
@@ -109,7 +109,9 @@ def write_map(
         sensor: (3,) of the anchor, local coordinates.
     """
     to_anchor = inverse(poses[members[0]])
-    points = np.concatenate([transform_points(to_anchor @ poses[k], surfaces[k].points) for k in members]) - sensor
+    points = (
+        np.concatenate([transform_points(to_anchor @ poses[k], surfaces[k].points) for k in members]) - sensor
+    )
     path = folder / f"{hashlib.sha256(points.tobytes()).hexdigest()[:24]}.npy"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)

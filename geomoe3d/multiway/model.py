@@ -10,24 +10,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from geomoe3d.batch.folder import foreign, has_mark, remove
-from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points, save_points
-from geomoe3d.clouds.prepare import voxel_means
+from geomoe3d.batch.folder import foreign, has_mark, remove, transform_name
+from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
+from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.geometry.se3 import inverse, shift_frames, transform_points
+from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.formats import g2o_text, kitti_text, tum_text
+from geomoe3d.multiway.merged import merge_clouds, write_e57, write_merged
 from geomoe3d.multiway.scans import Scan
+from geomoe3d.multiway.tables import (
+    EDGES_FILE,
+    EDGES_HEADER,
+    SCANS_FILE,
+    SCANS_HEADER,
+    edges_text,
+    scans_text,
+)
 from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
 
+MATRICES_FOLDER = "matrices"
+"""One 4 x 4 matrix per placed scan, as CloudCompare and others read it."""
+_POSE_MARK = "geomoe3d multiway pose: p_reference = R p_scan + t"
 POSES_FILE, PAGE_FILE = "poses.json", "page.html"
 PAGE_MARK = '<meta name="generator" content="geomoe3d multiway">'
-_FORMAT, _KIND = "geomoe3d scene 1", "geomoe3d scene "
-_GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|g2o|ply)")
+_FORMAT, _KIND = "geomoe3d scene 2", "geomoe3d scene "
+_GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|g2o|ply|e57)")
 _OFTEN_NO_CLOUDS = {".txt", ".csv", ".asc", ".bin", ".npy", ".npz"}
 
 
@@ -37,18 +47,44 @@ class EdgeReport:
 
     Attributes:
         source, target: names of the scans.
-        kept: whether it holds the model together.
-        reason: why not.
+        fate: ``kept``: it holds the model together; ``near``: it says about what the poses say; ``rejected``:
+            it contradicts them or is not sure enough; ``between groups``: it would join two groups.
+        reason: why it is not kept.
         confidence: of the registration.
+        belief: probability that it is right, in the company of the other pairs.
+        shift: root mean square distance by which it moves the source elsewhere than the final poses do, cloud
+            units, and ``turn_deg`` its angle; None where its scans stand in no common group.
+        closes_loop: whether the model hangs together without it, too.
+        of_maps: whether local maps about the two scans were registered, not the scans alone.
         T_target_source: (4, 4) file coordinates.
     """
 
     source: str
     target: str
-    kept: bool
+    fate: str
     reason: str
     confidence: float
+    belief: float
+    shift: float | None
+    turn_deg: float | None
+    closes_loop: bool
+    of_maps: bool
     T_target_source: FloatArray
+
+    @property
+    def kept(self) -> bool:
+        """Whether it holds the model together."""
+        return self.fate == "kept"
+
+
+@dataclass(frozen=True)
+class LoopReport:
+    """A loop of measured motions, see `geomoe3d.multiway.loops`; ``scans`` by name."""
+
+    scans: tuple[str, ...]
+    shift: float
+    turn_deg: float
+    closes: bool
 
 
 @dataclass(frozen=True)
@@ -59,13 +95,28 @@ class SceneGroup:
         reference: name of the first scan; its file coordinates are those of the group.
         poses: T_reference_scan (4, 4) by name, file coordinates: p_reference = R p_scan + t.
         local_poses: the same between local coordinates, by number of the scan.
-        edges: the kept ones.
+        edges: those near the poses.
+        loops: of its sure edges, the worst first.
     """
 
     reference: str
     poses: dict[str, FloatArray]
     local_poses: dict[int, FloatArray]
     edges: tuple[Edge, ...]
+    loops: tuple[LoopReport, ...] = ()
+
+    @property
+    def bent(self) -> str:
+        """A sentence where loops do not close, else empty."""
+        open_loops = [loop for loop in self.loops if not loop.closes]
+        if not open_loops:
+            return ""
+        worst = open_loops[0]
+        return (
+            f"{len(open_loops)} of {len(self.loops)} loops do not close: going round by "
+            f"'{worst.scans[0]}' and '{worst.scans[-1]}' ({len(worst.scans)} scans) ends {worst.shift:.3g} "
+            f"and {worst.turn_deg:.1f} deg off; the group may be bent there"
+        )
 
 
 @dataclass(frozen=True)
@@ -111,6 +162,16 @@ class SceneModel:
                         {"name": name, "path": paths[name], "T_reference_scan": T.tolist()}
                         for name, T in group.poses.items()
                     ],
+                    "bent": group.bent,
+                    "loops": [
+                        {
+                            "scans": list(loop.scans),
+                            "shift": loop.shift,
+                            "turn_deg": loop.turn_deg,
+                            "closes": loop.closes,
+                        }
+                        for loop in group.loops
+                    ],
                 }
                 for group in self.groups
             ],
@@ -123,8 +184,14 @@ class SceneModel:
                     "source": edge.source,
                     "target": edge.target,
                     "kept": edge.kept,
+                    "fate": edge.fate,
                     "reason": edge.reason,
                     "confidence": edge.confidence,
+                    "belief": edge.belief,
+                    "shift": edge.shift,
+                    "turn_deg": edge.turn_deg,
+                    "closes_loop": edge.closes_loop,
+                    "of_maps": edge.of_maps,
                     "T_target_source": edge.T_target_source.tolist(),
                 }
                 for edge in self.edges
@@ -158,11 +225,13 @@ def check_folder(folder: Path, inputs: Iterable[str | os.PathLike[str]], *, page
         for path in (folder / POSES_FILE, *groups):
             if path.exists():
                 raise InputError(foreign(path, "a model"))
+    for path in _foreign_extras(folder):
+        raise InputError(foreign(path, "a model"))
     path = folder / PAGE_FILE
     if page and path.exists() and not has_mark(path, PAGE_MARK):
         raise InputError(f"{foreign(path, 'a model')}, or leave the page out")
     for path in sorted(folder.iterdir()):
-        if path not in groups and _is_cloud(path):
+        if path not in (*groups, folder / SCANS_FILE, folder / EDGES_FILE) and _is_cloud(path):
             raise _among_scans(folder, path)
 
 
@@ -184,7 +253,11 @@ def remove_model(folder: Path) -> None:
     if has_mark(folder / PAGE_FILE, PAGE_MARK):
         remove([folder / PAGE_FILE])
     if is_model(folder):  # its poses go last: they say whose the others are
-        remove([*_group_files(folder), folder / POSES_FILE])
+        tables = [folder / SCANS_FILE, folder / EDGES_FILE]
+        remove([*_group_files(folder), *_own_poses(folder), *tables, folder / POSES_FILE])
+        place = folder / MATRICES_FOLDER
+        if place.is_dir() and not any(place.iterdir()):
+            place.rmdir()
 
 
 def _among_scans(folder: Path, scan: Path) -> InputError:
@@ -208,6 +281,25 @@ def _is_cloud(path: Path) -> bool:
     return True
 
 
+def _own_poses(folder: Path) -> list[Path]:
+    """The matrices of an earlier model, by their first lines."""
+    place = folder / MATRICES_FOLDER
+    return (
+        [path for path in sorted(place.glob("*.txt")) if has_mark(path, _POSE_MARK)] if place.is_dir() else []
+    )
+
+
+def _foreign_extras(folder: Path) -> list[Path]:
+    """Files of the user's under names that the tables and matrices of a model take."""
+    found = [folder / name for name in (SCANS_FILE, EDGES_FILE)]
+    headers = (SCANS_HEADER, EDGES_HEADER)
+    tables = [p for p, h in zip(found, headers, strict=True) if p.exists() and not has_mark(p, h)]
+    place, own = folder / MATRICES_FOLDER, set(_own_poses(folder))
+    if place.exists() and not place.is_dir():
+        return [*tables, place]
+    return [*tables, *(path for path in sorted(place.glob("*.txt")) if path not in own)]
+
+
 def _group_files(folder: Path) -> list[Path]:
     """What `write_model` writes per group."""
     return sorted(path for path in folder.glob("group*") if _GROUP_FILE.fullmatch(path.name))
@@ -225,17 +317,22 @@ def file_poses(
     return scans[first].name, poses
 
 
-def write_model(model: SceneModel, merged_voxel_size: float | None) -> None:
-    """poses.json, and per group its poses as text, its graph and its merged cloud; older ones are replaced.
+def write_model(model: SceneModel, merged_voxel_size: float | None, *, e57: bool = False) -> None:
+    """poses.json, tables, and per group its poses, its graph and its merged cloud; older ones are replaced.
 
     Args:
         model: what to write, into its folder.
         merged_voxel_size: of the merged clouds, cloud units; None takes that of the registration.
+        e57: all scans of a group with their poses in one file, too.
     """
     number = {scan.name: k for k, scan in enumerate(model.scans)}
     paths = {scan.name: scan.path for scan in model.scans}
     write_text(model.folder / POSES_FILE, model.to_json(), force=True)
-    remove(_group_files(model.folder))
+    write_text(model.folder / SCANS_FILE, scans_text(model), force=True)
+    write_text(model.folder / EDGES_FILE, edges_text(model), force=True)
+    remove([*_group_files(model.folder), *_own_poses(model.folder)])
+    poses_folder = model.folder / MATRICES_FOLDER
+    poses_folder.mkdir(exist_ok=True)
     for count, group in enumerate(model.groups, start=1):
         names, poses = list(group.poses), list(group.poses.values())
         prefix = model.folder / f"group{count}"
@@ -244,20 +341,15 @@ def write_model(model: SceneModel, merged_voxel_size: float | None) -> None:
         )
         write_text(prefix.with_suffix(".kitti.txt"), kitti_text(poses), force=True)
         write_text(prefix.with_suffix(".g2o"), g2o_text(group.local_poses, group.edges), force=True)
-        merged = merge_clouds([paths[n] for n in names], poses, merged_voxel_size or model.voxel_size)
-        save_points(prefix.with_suffix(".ply"), merged, force=True)
-
-
-def merge_clouds(paths: Sequence[str], poses: Sequence[FloatArray], voxel_size: float) -> FloatArray:
-    """(N, 3) mean points per voxel of all scans in the reference's file coordinates, one scan at a time.
-
-    Works about the first scan's origin in float64, so that map coordinates lose nothing.
-    """
-    origin = load_points(paths[0]).origin
-    parts = []
-    for path, T in zip(paths, poses, strict=True):
-        cloud = load_points(path)
-        local = shift_frames(T, -cloud.origin, -origin)
-        parts.append(voxel_means(transform_points(local, cloud.points), voxel_size))
-    merged: FloatArray = voxel_means(np.concatenate(parts), voxel_size) + origin
-    return merged
+        merged = merge_clouds(
+            [paths[n] for n in names],
+            [number[n] for n in names],
+            poses,
+            merged_voxel_size or model.voxel_size,
+        )
+        write_merged(prefix.with_suffix(".ply"), merged)
+        if e57:
+            write_e57(prefix.with_suffix(".e57"), [(n, paths[n], group.poses[n]) for n in names])
+        for name, T in group.poses.items():
+            comments = [_POSE_MARK, f"scan '{name}' in group {count}, the frame of '{group.reference}'"]
+            save_transform(poses_folder / transform_name(name), T, comments, force=True)

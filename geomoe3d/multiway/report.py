@@ -2,93 +2,110 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from geomoe3d.geometry.se3 import inverse
-from geomoe3d.multiway.edges import Edge, agrees, expected_error, predicted_motion
+from geomoe3d.geometry.se3 import shift_frames
+from geomoe3d.multiway.edges import Edge, agrees, differences, expected_error, predicted_motion
 from geomoe3d.multiway.grouping import Group
-from geomoe3d.multiway.model import EdgeReport, SceneGroup, SceneModel, file_poses
-from geomoe3d.multiway.survey import PairKey, Survey
-from geomoe3d.types import FloatArray
+from geomoe3d.multiway.loops import find_loops
+from geomoe3d.multiway.model import EdgeReport, LoopReport, SceneGroup, SceneModel, file_poses
+from geomoe3d.multiway.pose_graph import spanning_tree
+from geomoe3d.multiway.settling import is_kept
+from geomoe3d.multiway.survey import Survey
 
 
-def describe_model(survey: Survey, folder: Path, groups: list[Group]) -> SceneModel:
-    """The groups of two or more as a model, the rest with reasons."""
+def describe_model(survey: Survey, edges: Sequence[Edge], folder: Path, groups: list[Group]) -> SceneModel:
+    """The groups of two or more as a model, the rest with reasons.
+
+    Args:
+        survey: the scans and their pairs.
+        edges: all of them, with what cycles say.
+        folder: of the model.
+        groups: from `geomoe3d.multiway.assembly.Assembly`.
+    """
     origins = {k: shape.origin for k, shape in enumerate(survey.shapes)}
+    names = [scan.name for scan in survey.scans]
     placed = [group for group in groups if len(group.poses) > 1]
     made = []
     for group in placed:
         reference, poses = file_poses(group.poses, survey.scans, origins)
-        made.append(SceneGroup(reference, poses, dict(group.poses), tuple(group.edges)))
-    home = {scan: number for number, group in enumerate(placed) for scan in group.poses}
-    kept = {id(edge) for group in placed for edge in group.edges}
-    reports = [
-        EdgeReport(
-            survey.scans[edge.source].name,
-            survey.scans[edge.target].name,
-            id(edge) in kept,
-            "" if id(edge) in kept else _why_rejected(survey, edge, home, placed),
-            edge.confidence,
-            _file_motion(survey, pair),
+        loops = tuple(
+            LoopReport(tuple(names[k] for k in loop.scans), loop.shift, loop.turn_deg, loop.closes)
+            for loop in find_loops(group.poses, edges, survey.shapes, survey.voxel_size)
         )
-        for pair, edge in sorted(survey.edges.items())
-    ]
-    unplaced = {
-        survey.scans[k].name: _why_unplaced(survey, k) for k in range(len(survey.scans)) if k not in home
-    }
+        made.append(SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops))
+    home = {scan: group for group in placed for scan in group.poses}
+    tree = spanning_tree([edge for group in placed for edge in group.edges])
+    unplaced = {names[k]: _why_unplaced(survey, edges, k) for k in range(len(names)) if k not in home}
     return SceneModel(
         folder,
         survey.voxel_size,
         tuple(survey.scans),
         tuple(made),
         unplaced,
-        tuple(reports),
-        len(survey.outcomes),
+        tuple(_report(survey, edge, home, tree) for edge in edges),
+        len(survey.outcomes) + len(survey.map_edges),
         {},
     )
 
 
-def _file_motion(survey: Survey, pair: PairKey) -> FloatArray:
-    result = survey.outcomes[pair].result
-    assert result is not None
-    return result.T_target_source
-
-
-def _why_rejected(survey: Survey, edge: Edge, home: dict[int, int], groups: list[Group]) -> str:
+def _report(survey: Survey, edge: Edge, home: dict[int, Group], tree: set[int]) -> EdgeReport:
+    """What became of an edge, and why."""
     a, b = home.get(edge.source), home.get(edge.target)
-    if edge.worth <= survey.rules.least_worth:
-        return f"confidence {edge.confidence:.2f} is too low"
-    if a is None or b is None or a != b:
-        return "not enough speaks for it to tie its two scans"
-    predicted = predicted_motion(edge.source, edge.target, groups[a].poses)
     shape, rules = survey.shapes[edge.source], survey.rules
-    if agrees(predicted, edge.T_target_source, shape, rules.kept_tolerance, rules.kept_turn_deg):
-        error = expected_error(edge, groups[a].poses, shape, rules.correlation)
-        return f"what its two scans share holds them too loosely: the sensor may be {error:.2g} off"
-    if agrees(predicted, edge.T_target_source, shape, rules.tolerance, rules.turn_deg):
-        return "near the poses that the other pairs give, but not near enough"
-    apart = float(
-        np.linalg.norm(
-            (inverse(predicted) @ edge.T_target_source @ np.append(shape.center, 1))[:3] - shape.center
-        )
+    shift: float | None = None
+    turn: float | None = None
+    if a is None or a is not b:
+        fate = "between groups" if edge.worth > rules.least_worth else "rejected"
+        reason = "not enough speaks for it to tie its two scans" if edge.worth > rules.least_worth else ""
+    else:
+        predicted = predicted_motion(edge.source, edge.target, a.poses)
+        shifts, turns = differences(predicted[None], edge.T_target_source[None], [shape])
+        shift, turn = float(shifts[0]), float(turns[0])
+        near = any(edge is one for one in a.edges)
+        kept = near and is_kept(edge, a.poses, survey.shapes, rules)
+        fate, reason = ("kept" if kept else "near" if near else "rejected"), ""
+        if near and not kept:
+            reason = "near the poses that the other pairs give, but not near enough"
+            if agrees(predicted, edge.T_target_source, shape, rules.kept_tolerance, rules.kept_turn_deg):
+                error = expected_error(edge, a.poses, shape, rules.correlation)
+                reason = f"what its two scans share holds them too loosely: the sensor may be {error:.2g} off"
+        elif not near:
+            reason = f"it contradicts the poses that the other pairs give by {shift:.3g} and {turn:.1f} deg"
+    if fate == "rejected" and edge.worth <= rules.least_worth:
+        doubt = f"confidence {edge.confidence:.2f} is too low"
+        if edge.prior > rules.least_worth:
+            doubt = "other pairs of the same scans contradict it"
+        reason = doubt if not reason else f"{doubt}; {reason}"
+    return EdgeReport(
+        survey.scans[edge.source].name,
+        survey.scans[edge.target].name,
+        fate,
+        reason,
+        edge.confidence,
+        float(1 / (1 + np.exp(-np.clip(edge.worth, -30, 30)))),
+        shift,
+        turn,
+        fate in ("kept", "near") and id(edge) not in tree,
+        edge.of_maps,
+        shift_frames(edge.T_target_source, shape.origin, survey.shapes[edge.target].origin),
     )
-    return f"it contradicts the poses that the other pairs give by {apart:.3g}"
 
 
-def _why_unplaced(survey: Survey, scan: int) -> str:
+def _why_unplaced(survey: Survey, edges: Sequence[Edge], scan: int) -> str:
     if scan in survey.unusable:
         return survey.unusable[scan]
-    mine = [(edge, pair) for pair, edge in survey.edges.items() if scan in pair]
+    mine = [edge for edge in edges if scan in (edge.source, edge.target)]
     tried = sum(scan in pair for pair in survey.outcomes)
     if not mine:
         return f"none of its {tried} pairs gave a motion"
-    edge, pair = max(mine, key=lambda item: item[0].confidence)
-    other = survey.scans[pair[0] if pair[1] == scan else pair[1]].name
+    edge = max(mine, key=lambda edge: edge.confidence)
+    other = survey.scans[edge.source if edge.target == scan else edge.target].name
     surest = f"its surest of {tried} pairs, with '{other}', has confidence {edge.confidence:.3f}"
-    voices = sum(edge.worth > survey.rules.least_worth for edge, _ in mine)
+    voices = sum(edge.worth > survey.rules.least_worth for edge in mine)
     if voices > 1:
-        least = 1 / (1 + np.exp(-survey.rules.least_worth))
-        return f"{surest}, but its {voices} pairs above {least:.2g} do not agree on one place clearly enough"
+        return f"{surest}, but its {voices} likely pairs do not agree on one place clearly enough"
     return f"{surest}, and nothing agrees with it: one pair must be surer, or two must agree"

@@ -21,14 +21,21 @@ from geomoe3d.batch.task import Settings
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
 from geomoe3d.filters.base import resolved
+from geomoe3d.multiway.assembly import Assembly
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
 from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
 from geomoe3d.multiway.defaults import NEIGHBORS as NEIGHBORS
+from geomoe3d.multiway.initial import InitialPoses, read_poses
+from geomoe3d.multiway.merged import e57_library
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
 from geomoe3d.multiway.survey import Survey
 from geomoe3d.runtime.timing import StageClock
+
+_MAP_ROUNDS = 2
+_INITIAL_SHIFT = 2.0  # voxels
+_INITIAL_TURN_DEG = 2.0
 
 
 def register_scans(
@@ -45,6 +52,11 @@ def register_scans(
     scheduler: str | None = None,
     cache: str | None = None,
     fresh: bool = False,
+    sequence: bool = False,
+    initial: str | os.PathLike[str] | None = None,
+    initial_error: tuple[float, float] | None = None,
+    second_look: bool = False,
+    e57: bool = False,
     progress: Callable[[int, int], None] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> SceneModel:
@@ -66,6 +78,14 @@ def register_scans(
         page: write a page to turn the model in.
         workers, scheduler, cache: as in `geomoe3d.register_pairs`.
         fresh: forget what the folder holds of an earlier model; not before all that can be refused is known.
+        sequence: the scans are given in the order in which they were taken: those that follow each other are
+            registered first and are expected to overlap.
+        initial: a file with a pose per scan, see `geomoe3d.multiway.initial.read_poses`; implies a sequence.
+        initial_error: standard deviation of the motion between two scans that follow each other by these
+            poses, cloud units, and of its angle, degrees; None: two voxels and 2 degrees.
+        second_look: look twice at doubtful pairs as `geomoe3d.register` does; three times as slow, and what
+            triangles say makes up for it.
+        e57: write ``groupN.e57`` too: all points of all scans, each scan with its pose.
         progress: called with (pairs done, pairs in all so far proposed).
         say: called with sentences on what begins.
 
@@ -80,8 +100,12 @@ def register_scans(
         raise InputError(f"pairs is '{pairs}'; choose auto, all or similar")
     if neighbors < 1:
         raise InputError(f"neighbors is {neighbors}, at least 1 pair per scan must be proposed")
+    if initial_error is not None and not min(initial_error) > 0:
+        raise InputError(f"initial_error is {initial_error}, both numbers must be positive")
     if merged_voxel_size is not None and not merged_voxel_size > 0:
         raise InputError(f"merged_voxel_size is {merged_voxel_size}, it must be positive")
+    if e57:
+        e57_library()
     paths, folder = as_paths(scans), Path(out)
     labour = Labour(workers, scheduler, cache)
     labour.check()
@@ -91,39 +115,50 @@ def register_scans(
     found = find_scans(paths)
     stored = None if fresh else _stored_voxel_size(folder / "pairs")
     clock("look at the scans")
-    config, unusable = _with_voxel_size(resolved(config), stored, found)
+    given = None if initial is None else read_poses(initial, [scan.name for scan in found])
+    config = resolved(config)
+    if not second_look:
+        config = _looked_at_once(config)
+    config, unusable = _with_voxel_size(config, stored, found)
+    poses = None
+    if given is not None:
+        shift, turn = initial_error or (_INITIAL_SHIFT * float(config.voxel_size or 0.0), _INITIAL_TURN_DEG)
+        poses = InitialPoses(given, shift, turn)
     store = BatchStore(folder / "pairs", config, fresh=fresh)
     if store.begins:
         _try_out(labour, found, Settings.of(config, cache) if fresh else None)
-    survey = Survey(found, config, store, labour, progress, say)
+    survey = Survey(found, config, store, labour, progress, say, sequence=sequence, initial=poses)
     survey.describe(unusable)
     store.begin()
     if fresh:
         remove_model(folder)
     clock("register pairs")
-    survey.register(
-        survey.first_pairs(pairs == "all" or (pairs == "auto" and len(found) <= ALL_PAIRS_UP_TO), neighbors)
-    )
+    everything = pairs == "all" or (pairs == "auto" and len(found) <= ALL_PAIRS_UP_TO)
+    survey.register(survey.first_pairs(everything, neighbors))
+    assembly = Assembly(survey)
     clock("group scans")
-    groups = survey.group()
-    for count in range(rounds):
-        more = survey.further_pairs(groups, neighbors, closing=count == 0)
-        if more:
-            clock("register further pairs")
-            survey.register(more)
-            clock("group scans")
-            groups = survey.group()
-        maps = survey.map_pairs(groups)
-        if maps:
-            clock("register local maps")
-            survey.register_maps(maps, groups)
-            clock("group scans")
-            groups = survey.group()
-        if not more and not maps:
+    groups = assembly.groups()
+    for count in range(rounds):  # twice as many in every round: what hangs together early costs little
+        more = survey.further_pairs(groups, neighbors * 2**count, closing=count == 0)
+        if not more:
+            break
+        clock(f"round {count + 1} of at most {rounds}: register {len(more)} further pairs")
+        survey.register(more)
+        clock("group scans")
+        groups = assembly.groups()
+    for count in range(min(rounds, _MAP_ROUNDS)):
+        maps = survey.map_pairs(groups, assembly.edges)
+        if not maps:
+            break
+        clock(f"local maps, round {count + 1} of at most {_MAP_ROUNDS}: register {len(maps)} pairs of them")
+        survey.register_maps(maps, groups)
+        clock("group scans")
+        known, groups = groups, assembly.groups()
+        if len(groups) == len(known):
             break
     clock("write the model")
-    model = describe_model(survey, folder, groups)
-    write_model(model, merged_voxel_size)
+    model = describe_model(survey, assembly.edges, folder, groups)
+    write_model(model, merged_voxel_size, e57=e57)
     if page:
         from geomoe3d.multiway.page import save_model_page
 
@@ -153,6 +188,12 @@ def _with_voxel_size(
         size, unusable = choose_common_voxel_size(scans, config.preparation)
     tree: dict[str, Any] = {**config.model_dump(), "voxel_size": size}
     return build_config(RegistrationConfig, tree), unusable
+
+
+def _looked_at_once(config: RegistrationConfig) -> RegistrationConfig:
+    """The configuration without second looks at doubtful pairs."""
+    look = {**config.second_look.model_dump(), "grids": (), "max_correspondences": 0}
+    return build_config(RegistrationConfig, {**config.model_dump(), "second_look": look})
 
 
 def _stored_voxel_size(folder: Path) -> float | None:

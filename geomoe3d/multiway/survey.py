@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,32 +19,29 @@ from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
-from geomoe3d.multiway.alignment import Surface, align_groups, align_scans
-from geomoe3d.multiway.cycles import with_cycles
-from geomoe3d.multiway.edges import Edge, Shape, agrees, edge_of, predicted_motion
-from geomoe3d.multiway.free_space import FreeSpace, told_by
-from geomoe3d.multiway.grouping import Group, GroupingRules, Growth, Poses, largest_first, reconsidered
+from geomoe3d.multiway.alignment import Surface
+from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
+from geomoe3d.multiway.free_space import FreeSpace
+from geomoe3d.multiway.grouping import Group, GroupingRules
+from geomoe3d.multiway.initial import InitialPoses
 from geomoe3d.multiway.maps import MAPS_FOLDER, MapPair, map_pairs, write_map
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.proposals import most_similar, scan_similarity
 from geomoe3d.multiway.scans import Scan, natural_key
-from geomoe3d.multiway.settling import settle
 from geomoe3d.registration import Registrar
 from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray
 
-_MOST_SETTLINGS = 3
 _TOLERANCE = 4.0  # voxels; see GroupingRules
 _NEAR_TOLERANCE = 2.5
 _KEPT_TOLERANCE = 1.5
 _KEPT_ERROR = 3.0
 _CLOSING_OVERLAP = 0.3
-_SILENCE = ((0.3, 2.5), (0.2, 1.0), (0.1, 0.4))
-"""Least overlap both ways, and log-odds against a motion under which a registered pair would overlap so much
-but was registered otherwise. Of pairs that overlap by 0.3, 0.2 and 0.1, 98, 87 and 66 % are registered rightly."""
 _CLOSING_PER_SCAN = 1
-_SHARED_SILENCE = 0.5  # what makes one pair fail makes its neighbours fail
+_GUESSED_OVERLAP = 0.1
+_ODOMETRY_CONFIDENCE = 0.9
+_ODOMETRY_POINTS = 100.0  # matched points that a given pose counts as, where registered pairs have a thousand
 
 PairKey = tuple[int, int]
 """A pair of scans by their numbers, the smaller first; which of them is the source is told by the edge."""
@@ -62,9 +60,11 @@ class Survey:
         labour: who registers them; its cache holds the described scans too.
         progress: called with (pairs done, pairs in all so far proposed), or None.
         say: called with sentences on what begins.
+        sequence: whether the scans are given in the order in which they were taken.
+        initial: poses of all scans from elsewhere, as of odometry; implies a sequence.
 
     Attributes:
-        scans, config, store, labour, progress, say: as given.
+        scans, config, store, labour, progress, say, sequence, initial: as given.
         voxel_size: edge of the common grid.
         rules: when groups are joined and edges kept.
         unusable: why a scan cannot be registered, by number.
@@ -77,7 +77,6 @@ class Survey:
         edges: those of them that gave a motion, with motions (4, 4) in local coordinates.
         map_edges: edges between scans that local maps about them gave, by the pair's id.
         free_space: tells what the sensors saw through.
-        aligned: poses T_group_scan (4, 4) in local coordinates after `align`, by the poses before it.
     """
 
     def __init__(
@@ -88,16 +87,19 @@ class Survey:
         labour: Labour,
         progress: Callable[[int, int], None] | None,
         say: Callable[[str], None],
+        *,
+        sequence: bool = False,
+        initial: InitialPoses | None = None,
     ) -> None:
         self.scans, self.config, self.store, self.labour = scans, config, store, labour
         self.progress, self.say = progress, say
+        self.sequence, self.initial = sequence or initial is not None, initial
         self.voxel_size = float(config.voxel_size or 0.0)
         tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE, _KEPT_ERROR)
         self.rules = GroupingRules(*(tolerance * self.voxel_size for tolerance in tolerances))
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
         self.surfaces: dict[int, Surface] = {}
-        self.aligned: dict[tuple[tuple[int, bytes], ...], dict[int, FloatArray]] = {}
         self.overlaps = Overlaps({})
         self.free_space = FreeSpace({}, {}, self.voxel_size)
         self.similarity: FloatArray = np.zeros((0, 0))
@@ -162,14 +164,16 @@ class Survey:
         """
         usable = self.usable()
         known = self._known()
+        if self.sequence:
+            known |= {key_of(i, j) for i, j in pairwise(usable) if j == i + 1}
         if everything:
             return sorted({(i, j) for j in usable for i in usable if i < j})
-        settled = {scan for pair in known for scan in pair}
+        settled = {scan for pair in self._known() for scan in pair}
         wanted = set(known)
         for scan in usable:
             for other in most_similar(self.similarity, scan, usable, neighbors):
                 if scan not in settled or other not in settled:
-                    wanted.add(_key(scan, other))
+                    wanted.add(key_of(scan, other))
         return sorted(wanted)
 
     def further_pairs(self, groups: list[Group], neighbors: int, *, closing: bool) -> list[PairKey]:
@@ -187,9 +191,9 @@ class Survey:
                 continue
             outside = [k for k in self.usable() if k not in group.poses]
             for scan in group.poses:
-                untried = [k for k in outside if _key(scan, k) not in self.outcomes]
+                untried = [k for k in outside if key_of(scan, k) not in self.outcomes]
                 found = most_similar(self.similarity, scan, untried, neighbors)
-                more |= {_key(scan, other) for other in found}
+                more |= {key_of(scan, other) for other in found}
         for group in groups if closing else []:
             more |= self._closing_pairs(group)
         return sorted(more)
@@ -208,10 +212,15 @@ class Survey:
             chosen |= {(i, j) for _, i in sorted(found)[:_CLOSING_PER_SCAN]}
         return chosen
 
-    def map_pairs(self, groups: list[Group]) -> list[MapPair]:
-        """Pairs of local maps that could tie groups which are still apart."""
+    def map_pairs(self, groups: list[Group], edges: Sequence[Edge]) -> list[MapPair]:
+        """Pairs of local maps that could tie groups which are still apart.
+
+        Args:
+            groups: as they stand, the largest first.
+            edges: all so far, with what cycles say of them.
+        """
         usable = [group for group in groups if set(group.poses) <= self.surfaces.keys()]
-        return map_pairs(usable, self.heard(), self.similarity, self.overlaps)
+        return map_pairs(usable, edges, self.similarity, self.overlaps)
 
     def _known(self) -> set[PairKey]:
         """Pairs in the journal whose scans and files are the same today."""
@@ -231,7 +240,18 @@ class Survey:
     def _row(self, pair: PairKey) -> PairRow:
         source, target = (self.scans[k].path for k in self._ends(pair))
         # Paths, not names: two pairs may have one name between them, and names grow as scans join.
-        return PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
+        return PairRow(json.dumps([source, target], ensure_ascii=False), source, target, self._guess(pair))
+
+    def _guess(self, pair: PairKey) -> tuple[float, ...] | None:
+        """The motion of a pair by the given poses, by rows, where they say that it overlaps."""
+        if self.initial is None:
+            return None
+        source, target = self._ends(pair)
+        T = inverse(self.initial.poses[target]) @ self.initial.poses[source]
+        local = shift_frames(T, -self.shapes[source].origin, -self.shapes[target].origin)
+        if self.overlaps.of(source, target, local) < _GUESSED_OVERLAP:
+            return None
+        return tuple(float(value) for value in T.ravel())
 
     # ---- registering and grouping
 
@@ -288,94 +308,28 @@ class Survey:
             pair, outcome = pairs[number], self.store.outcome(records[row.id])
             edge = edge_of(outcome, pair.source, pair.target, frames)
             if edge is not None:
-                self.map_edges[row.id] = edge
+                self.map_edges[row.id] = replace(edge, of_maps=True)
+
+    def odometry(self) -> list[Edge]:
+        """Edges between scans taken one after the other, as the given poses have them; none without such."""
+        if self.initial is None:
+            return []
+        found = []
+        sigma = [np.radians(self.initial.turn_deg)] * 3 + [self.initial.shift] * 3
+        information = np.diag(1 / np.square(sigma))
+        information *= _ODOMETRY_POINTS / float(np.trace(information[3:, 3:]))
+        for i, j in pairwise(self.usable()):
+            T = inverse(self.initial.poses[i]) @ self.initial.poses[j]
+            local = shift_frames(T, -self.shapes[j].origin, -self.shapes[i].origin)
+            found.append(Edge(j, i, local, _ODOMETRY_CONFIDENCE, information, self.initial.shift))
+        return found
 
     def _stand(self, scan: int) -> FloatArray:
         """(3,) where the sensor of a scan stood, or zero where that is not known; local coordinates."""
         known = scan in self.surfaces and self.surfaces[scan].signed
         return self.shapes[scan].sensor if known else np.zeros(3)
 
-    def group(self) -> list[Group]:
-        """Groups by all edges so far; a scan that cannot be used is a group of its own.
 
-        What settling lets go may find its place among scans that are better aligned now, so groups are joined
-        and settled again while that joins any.
-        """
-        edges = self.heard()
-        groups = [Group({k: np.eye(4)}) for k in range(len(self.scans))]
-        for turn in range(_MOST_SETTLINGS):
-            grown = Growth(groups, edges, self.shapes, self.rules, self.witness).run()
-            if turn and len(grown) == len(groups):
-                break
-            grown = [part for group in grown for part in reconsidered(group, edges, self.shapes, self.rules, self.witness)]
-            groups = [
-                part for group in grown for part in settle(group, edges, self.shapes, self.rules, self.align)
-            ]
-        return largest_first(groups)
-
-    def heard(self) -> list[Edge]:
-        """All edges so far, with what cycles say of them."""
-        best = dict(self.edges)
-        further: list[Edge] = []
-        for edge in self.map_edges.values():
-            pair = _key(edge.source, edge.target)
-            one = best.get(pair)
-            if one is None or not self._alike(one, edge):
-                further.append(edge)
-            elif edge.confidence > one.confidence:  # the same said twice is no second witness
-                best[pair] = edge
-        edges = [*(best[key] for key in sorted(best)), *further]
-        return with_cycles(edges, self.shapes, self.rules.tolerance, self.rules.turn_deg)
-
-    def _alike(self, one: Edge, other: Edge) -> bool:
-        T = other.T_target_source if other.source == one.source else inverse(other.T_target_source)
-        return agrees(
-            one.T_target_source, T, self.shapes[one.source], self.rules.tolerance, self.rules.turn_deg
-        )
-
-    def witness(
-        self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray], T_a_b: FloatArray
-    ) -> tuple[FloatArray, float]:
-        """What the scans say of joining two groups, see `geomoe3d.multiway.grouping.Witness`.
-
-        Of two single scans nothing: registration asked them already.
-        """
-        if len(a) * len(b) == 1:
-            return T_a_b, 0.0
-        T_a_b = align_groups(a, b, T_a_b, self.surfaces, self.overlaps, self.voxel_size)
-        silent = sum(self._silence(i, j, inverse(a[i]) @ T_a_b @ b[j]) for i, j in self._tried_between(a, b))
-        return T_a_b, told_by(*self.free_space.between(a, b, T_a_b)) - _SHARED_SILENCE * silent
-
-    def _tried_between(
-        self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray]
-    ) -> list[tuple[int, int]]:
-        """Registered pairs (i in a, j in b) across two groups."""
-        return [(i, j) for i in a for j in b if _key(i, j) in self.outcomes]
-
-    def _silence(self, i: int, j: int, T_i_j: FloatArray) -> float:
-        """Log-odds against a motion by a pair that would overlap under it, but was registered otherwise."""
-        overlap = min(self.overlaps.of(j, i, T_i_j), self.overlaps.of(i, j, inverse(T_i_j)))
-        told = next((odds for least, odds in _SILENCE if overlap >= least), 0.0)
-        edge = self.edges.get(_key(i, j))
-        if told == 0.0 or edge is None:
-            return told
-        T = T_i_j if edge.target == i else inverse(T_i_j)
-        near = 2 * self.rules.tolerance, 2 * self.rules.turn_deg
-        return 0.0 if agrees(T, edge.T_target_source, self.shapes[edge.source], *near) else told
-
-    def align(self, poses: Poses) -> Poses:
-        """The poses of a group laid on each other by the scans' surfaces; once, however often asked.
-
-        Args:
-            poses: T_group_scan (4, 4) in local coordinates, by number; so is what is returned.
-        """
-        key = tuple((scan, poses[scan].tobytes()) for scan in sorted(poses))
-        if key not in self.aligned:
-            self.aligned[key] = align_scans(
-                poses, self.surfaces, self.overlaps, self.voxel_size, seed=self.config.seed
-            )
-        return dict(self.aligned[key])
-
-
-def _key(a: int, b: int) -> PairKey:
+def key_of(a: int, b: int) -> PairKey:
+    """The key of a pair of scans."""
     return (a, b) if a < b else (b, a)

@@ -1,0 +1,144 @@
+"""From registered pairs to groups with poses: triangles, growth, second thoughts, surfaces.
+
+Place: after every round of pairs. What speaks for an edge is heard first (`cycles`), then groups grow
+(`grouping`), where two groups meet their scans are asked (free space, and pairs that should have been
+registered rightly and were not), every scan with a rival place is weighed again, and what came of it is laid
+on its surfaces (`settling`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from geomoe3d.geometry.se3 import inverse
+from geomoe3d.multiway.alignment import align_groups, align_scans
+from geomoe3d.multiway.cycles import with_cycles
+from geomoe3d.multiway.edges import Edge, agrees
+from geomoe3d.multiway.free_space import told_by
+from geomoe3d.multiway.grouping import Group, Growth, Poses, largest_first, reconsidered
+from geomoe3d.multiway.settling import settle
+from geomoe3d.multiway.survey import Survey, key_of
+from geomoe3d.types import FloatArray
+
+_MOST_TURNS = 3
+_SILENCE = ((0.3, 2.5), (0.2, 1.0), (0.1, 0.4))
+"""Least overlap both ways, and log-odds against a motion under which a registered pair would overlap so much
+but was registered otherwise. Of pairs that overlap by 0.3, 0.2 and 0.1 and more 98, 87 and 66 % are right."""
+_SHARED_SILENCE = 0.5  # what makes one pair fail makes its neighbours fail
+_IN_SEQUENCE = 3.0  # log-odds that scans taken one after the other overlap, beyond what others have
+
+
+class Assembly:
+    """Puts the scans of a survey together, again after every round.
+
+    Args:
+        survey: described scans and what is known of their pairs.
+
+    Attributes:
+        edges: those that the last groups were made of, with what triangles say of them.
+    """
+
+    def __init__(self, survey: Survey) -> None:
+        self._survey = survey
+        self.edges: list[Edge] = []
+        self._aligned: dict[tuple[tuple[int, bytes], ...], Poses] = {}
+
+    def groups(self) -> list[Group]:
+        """Groups by all edges so far; a scan that cannot be used is a group of its own.
+
+        What settling lets go may find its place among scans that are better aligned now, so groups are joined
+        and settled again while that joins any.
+        """
+        survey, edges = self._survey, self._heard()
+        self.edges = edges
+        told = edges, survey.shapes, survey.rules
+        groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
+        for turn in range(_MOST_TURNS):
+            grown = Growth(groups, *told, self.witness).run()
+            if turn and len(grown) == len(groups):
+                break
+            placed = [part for group in grown for part in reconsidered(group, *told, self.witness)]
+            groups = [part for group in placed for part in settle(group, *told, self.align)]
+        return largest_first(groups)
+
+    def _heard(self) -> list[Edge]:
+        """All edges so far, with what triangles and the order of the scans say of them.
+
+        Where a pair of scans and one of local maps about them agree, the surer of the two is taken: the same
+        said twice is no second witness.
+        """
+        survey = self._survey
+        best, further = dict(survey.edges), list[Edge]()
+        for edge in [*survey.map_edges.values(), *survey.odometry()]:
+            pair = key_of(edge.source, edge.target)
+            one = best.get(pair)
+            if one is None or not self._alike(one, edge):
+                further.append(edge)
+            elif edge.confidence > one.confidence:
+                best[pair] = edge
+        edges = [*(best[key] for key in sorted(best)), *further]
+        if survey.sequence:
+            edges = [replace(e, expected=_IN_SEQUENCE) if abs(e.source - e.target) == 1 else e for e in edges]
+        return with_cycles(edges, survey.shapes, survey.rules.tolerance, survey.rules.turn_deg)
+
+    def _alike(self, one: Edge, other: Edge) -> bool:
+        T = other.T_target_source if other.source == one.source else inverse(other.T_target_source)
+        return agrees(
+            one.T_target_source,
+            T,
+            self._survey.shapes[one.source],
+            self._survey.rules.tolerance,
+            self._survey.rules.turn_deg,
+        )
+
+    def witness(
+        self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray], T_a_b: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """What the scans say of joining two groups, see `geomoe3d.multiway.grouping.Witness`.
+
+        Of two single scans nothing: registration asked them already.
+        """
+        if len(a) * len(b) == 1:
+            return T_a_b, 0.0
+        T_a_b = align_groups(
+            a, b, T_a_b, self._survey.surfaces, self._survey.overlaps, self._survey.voxel_size
+        )
+        silent = sum(self._silence(i, j, inverse(a[i]) @ T_a_b @ b[j]) for i, j in self._tried_between(a, b))
+        return T_a_b, told_by(*self._survey.free_space.between(a, b, T_a_b)) - _SHARED_SILENCE * silent
+
+    def _tried_between(
+        self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray]
+    ) -> list[tuple[int, int]]:
+        """Registered pairs (i in a, j in b) across two groups."""
+        return [(i, j) for i in a for j in b if key_of(i, j) in self._survey.outcomes]
+
+    def _silence(self, i: int, j: int, T_i_j: FloatArray) -> float:
+        """Log-odds against a motion by a pair that would overlap under it, but was registered otherwise."""
+        overlap = min(self._survey.overlaps.of(j, i, T_i_j), self._survey.overlaps.of(i, j, inverse(T_i_j)))
+        told = next((odds for least, odds in _SILENCE if overlap >= least), 0.0)
+        edge = self._survey.edges.get(key_of(i, j))
+        if told == 0.0 or edge is None:
+            return told
+        T = T_i_j if edge.target == i else inverse(T_i_j)
+        near = 2 * self._survey.rules.tolerance, 2 * self._survey.rules.turn_deg
+        return 0.0 if agrees(T, edge.T_target_source, self._survey.shapes[edge.source], *near) else told
+
+    def align(self, poses: Poses) -> Poses:
+        """The poses of a group laid on each other by the scans' surfaces; once, however often asked.
+
+        Args:
+            poses: T_group_scan (4, 4) in local coordinates, by number; so is what is returned.
+        """
+        key = tuple((scan, poses[scan].tobytes()) for scan in sorted(poses))
+        if key not in self._aligned:
+            self._aligned[key] = align_scans(
+                poses,
+                self._survey.surfaces,
+                self._survey.overlaps,
+                self._survey.voxel_size,
+                seed=self._survey.config.seed,
+            )
+        return dict(self._aligned[key])

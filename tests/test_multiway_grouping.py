@@ -110,7 +110,9 @@ def test_a_scan_with_a_rival_place_is_put_where_the_whole_model_wants_it():
     def witness(a, b, T):
         return T, 0.0
 
-    (group, *released) = reconsidered(Group(misplaced, [*held, wrong]), [*edges, wrong], shapes, RULES, witness)
+    (group, *released) = reconsidered(
+        Group(misplaced, [*held, wrong]), [*edges, wrong], shapes, RULES, witness
+    )
     assert not released
     assert largest_error(group.poses, truth) < 0.05
     few = [*held, wrong, next(e for e in edges if 5 in (e.source, e.target))]  # one against one: nobody knows

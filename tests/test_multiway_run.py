@@ -154,7 +154,7 @@ def test_the_page_shows_the_scans_and_edges_that_are_chosen(model, tmp_path):
   const log = [], { dataset } = document.body;
   const note = async () => { await settle(); log.push([dataset.drawnPoints, dataset.drawnLines]); };
   await note();
-  for (const one of ["#none", '[data-scan="scan_1"]', "#classes input", "#all"]) {
+  for (const one of ["#none", '[data-scan="scan_1"]', "#classes input", "#all", "button.pair"]) {
     document.querySelector(one).click();
     await note();
   }
@@ -167,7 +167,9 @@ def test_the_page_shows_the_scans_and_edges_that_are_chosen(model, tmp_path):
     data = page_data(page)
     sizes = {cloud["name"]: len(base64.b64decode(cloud["points"])) // 12 for cloud in data["clouds"]}
     num, edges = sum(sizes.values()), data["lines"]["classes"][0]["drawn"]
-    shown = [(num, edges), (0, edges), (sizes["scan_1"], edges), (sizes["scan_1"], 0), (num, 0)]
+    first = max((e for e in model.edges if e.kept), key=lambda edge: edge.shift)
+    alone = sizes[first.source] + sizes[first.target]
+    shown = [(num, edges), (0, edges), (sizes["scan_1"], edges), (sizes["scan_1"], 0), (num, 0), (alone, 0)]
     assert json.loads(seen["log"]) == [[str(points), str(lines)] for points, lines in shown]
 
 

@@ -29,7 +29,7 @@ _SHOWN = 20
     type=click.IntRange(1),
     default=NEIGHBORS,
     metavar="N",
-    help=f"Pairs tried per scan and round. [{NEIGHBORS}]",
+    help=f"Pairs tried per scan, twice as many in each further round. [{NEIGHBORS}]",
 )
 @click.option(
     "--model-voxel-size",
@@ -61,6 +61,21 @@ _SHOWN = 20
     multiple=True,
     help="One value of the configuration; repeatable.",
 )
+@click.option("--sequence", is_flag=True, help="The scans are in the order in which they were taken.")
+@click.option(
+    "--initial",
+    metavar="FILE",
+    help="A pose per scan (TUM, KITTI or JSON), such as of odometry; implies --sequence.",
+)
+@click.option(
+    "--initial-error",
+    nargs=2,
+    type=float,
+    metavar="LENGTH DEGREES",
+    help="Standard deviation of the motion between two scans by these poses. [2 voxels, 2 degrees]",
+)
+@click.option("--second-look", is_flag=True, help="Look twice at doubtful pairs: three times as slow.")
+@click.option("--e57", is_flag=True, help="Write OUT/groupN.e57 too: every point, each scan with its pose.")
 @click.option("--page/--no-page", default=True, help="Write OUT/page.html, or do not. [--page]")
 @click.option("--fresh", is_flag=True, help="Delete the earlier model in OUT first.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
@@ -81,6 +96,11 @@ def command(
     config_file: str | None,
     assignments: tuple[str, ...],
     page: bool,
+    sequence: bool,
+    initial: str | None,
+    initial_error: tuple[float, float] | None,
+    second_look: bool,
+    e57: bool,
     fresh: bool,
     cache: str | None,
     quiet: bool,
@@ -118,6 +138,11 @@ def command(
             scheduler=scheduler,
             cache=cache,
             fresh=fresh,
+            sequence=sequence,
+            initial=initial,
+            initial_error=initial_error,
+            second_look=second_look,
+            e57=e57,
             progress=progress,
             say=lambda text: None if quiet else click.echo(text, err=True),
         )
@@ -136,7 +161,13 @@ def summary(model: SceneModel) -> str:
         + f"; {model.num_pairs:,} pairs registered, {kept:,} edges kept; model in {model.folder}",
     ]
     for number, group in enumerate(model.groups, start=1):
-        lines.append(f"  group {number}: {len(group.poses)} scans in the frame of '{group.reference}'")
+        closed = sum(loop.closes for loop in group.loops)
+        lines.append(
+            f"  group {number}: {len(group.poses)} scans in the frame of '{group.reference}'; "
+            f"{closed} of {len(group.loops)} loops close"
+        )
+        if group.bent:
+            lines.append(click.style(f"    {group.bent}", fg="yellow"))
     if model.unplaced:
         lines.append("not placed:")
     for name, reason in list(model.unplaced.items())[:_SHOWN]:

@@ -2,8 +2,8 @@
 
 Two groups are joined by the motion for which most speaks: edges between them that agree add up, the best
 other motion is taken off, and so is what the scans themselves contradict, such as points of one group where
-sensors of the other saw through. The surest joint is made first. What has been joined is never torn by weaker edges:
-these are found to disagree with the poses and rejected. Cost: some milliseconds per joined scan.
+sensors of the other saw through. The surest joint is made first. What has been joined is never torn by
+weaker edges: these are found to disagree with the poses and rejected. Cost: milliseconds per joined scan.
 """
 
 from __future__ import annotations

@@ -35,13 +35,11 @@ class MapPair:
     Attributes:
         source, target: numbers of their anchors, the larger first.
         members: the scans of both maps, the anchor first.
-        T_target_source: (4, 4) between the anchors' local frames as a doubtful edge has it, or None.
     """
 
     source: int
     target: int
     members: tuple[tuple[int, ...], tuple[int, ...]]
-    T_target_source: FloatArray | None
 
 
 def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]:
@@ -75,23 +73,19 @@ def map_pairs(
             ((i, j) for i in a.poses for j in b.poses if np.isfinite(similarity[i, j])),
             key=lambda pair: (-similarity[pair], pair),
         )
-        wanted: list[tuple[int, int, FloatArray | None]] = [
-            (e.source, e.target, e.T_target_source) for e in crossing
-        ]
-        half = _PER_TWO_GROUPS // 2
+        likely = [(max(e.source, e.target), min(e.source, e.target)) for e in crossing]
+        lots = (likely, _PER_TWO_GROUPS // 2), ([(max(p), min(p)) for p in alike], _PER_TWO_GROUPS)
         chosen: list[MapPair] = []
-        for lot, limit in ((wanted, half), ([(j, i, None) for i, j in alike], _PER_TWO_GROUPS)):
-            for source, target, T in lot:
+        for lot, limit in lots:
+            for source, target in lot:
                 if len(chosen) >= limit:
                     break
                 if any({source, target} <= set(sum(pair.members, ())) for pair in chosen):
                     continue  # a map of these was chosen already
-                if source < target:
-                    source, target, T = target, source, None if T is None else inverse(T)
                 for scan in (source, target):
                     if scan not in known:
                         known[scan] = members_of(scan, a.poses if scan in a.poses else b.poses, overlaps)
-                chosen.append(MapPair(source, target, (known[source], known[target]), T))
+                chosen.append(MapPair(source, target, (known[source], known[target])))
         found += [pair for pair in chosen if max(map(len, pair.members)) > 1]
     return found[:_MOST]
 

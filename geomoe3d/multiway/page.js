@@ -42,6 +42,10 @@
     invalidate();
   }
   boxes.forEach((box) => box.addEventListener("change", () => show(box, box.checked)));
+  document.querySelectorAll("button.pair").forEach((button) => button.addEventListener("click", () => {
+    const { source, target } = button.dataset;
+    boxes.forEach((box) => show(box, box.dataset.scan === source || box.dataset.scan === target));
+  }));
   byId("all").addEventListener("click", () => boxes.forEach((box) => show(box, true)));
   byId("none").addEventListener("click", () => boxes.forEach((box) => show(box, false)));
   data.lines.classes.forEach((kind, i) => {

@@ -67,6 +67,7 @@ def render_model_page(model: SceneModel) -> str:
         "groups": model.groups,
         "colors": colors,
         "unplaced": model.unplaced,
+        "kept": sorted((edge for edge in model.edges if edge.kept), key=lambda edge: -(edge.shift or 0.0)),
         "doubtful": sorted(doubtful, key=lambda edge: -edge.confidence),
     }
     return render_cloud_page("multiway", "page", values, data)

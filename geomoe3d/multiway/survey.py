@@ -295,11 +295,7 @@ class Survey:
                 )
                 for members in pair.members
             )
-            initial = None
-            if pair.T_target_source is not None:
-                ends = -self._stand(pair.source), -self._stand(pair.target)
-                initial = tuple(float(x) for x in shift_frames(pair.T_target_source, *ends).ravel())
-            rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target, initial)
+            rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
         unique = {row.id: row for row in rows.values()}
         records, _ = work(
             list(unique.values()), self.store, self.config, self.labour, progress=self._count(), say=self.say

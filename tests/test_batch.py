@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -141,6 +142,19 @@ def test_every_pair_has_its_answer_and_a_broken_file_fails_its_own_pair_alone(sc
     assert (report.made, report.kept) == (5, 0)
 
 
+def test_results_are_a_table_too(finished):
+    report, out = finished
+    with (out / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["id"] for row in rows] == [outcome.id for outcome in report.outcomes]
+    assert [row["status"] for row in rows] == ["ok"] * 3 + ["error"] * 2
+    for row, outcome in zip(rows[:3], report.outcomes[:3], strict=True):
+        T = np.array([float(row[name]) for name in MATRIX_COLUMNS]).reshape(4, 4)
+        assert T.tobytes() == outcome.result.T_target_source.tobytes()
+        assert float(row["confidence"]) == outcome.result.confidence
+    assert "broken.ply" in rows[3]["reasons"] and rows[3]["T00"] == ""
+
+
 def test_a_result_is_what_register_gives(scans, finished):
     folder, _ = scans
     one = Registrar(CONFIG).register(folder / "a.npy", folder / "b.npy")
@@ -270,7 +284,7 @@ def test_beginning_anew_removes_what_the_batch_left_and_nothing_else(scans, copi
     register_pairs(one, copied, config=other, fresh=True)
     left = {path.relative_to(copied).as_posix() for path in everything(copied)}
     kept = {"notes.md", "transforms/ab.npy", "transforms/mine.txt", "transforms/ab before.txt"}
-    assert left == {"run.json", JOURNAL_FILE, RESULTS_FILE, *kept}
+    assert left == {"run.json", JOURNAL_FILE, RESULTS_FILE, "results.csv", *kept}
     for path in (*mine, renamed):
         path.unlink()
     (copied / "page.html").write_text("<html>mine</html>")
@@ -297,6 +311,7 @@ def test_transforms_of_pairs_that_have_none_any_more_are_removed(scans, copied, 
     ("name", "named"),
     [
         ("results.jsonl", {}),
+        ("results.csv", {}),
         ("journal.jsonl", {}),
         ("run.json", {}),
         ("page.html", {"page": True}),

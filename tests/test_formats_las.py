@@ -60,7 +60,7 @@ def test_truncated_and_lying_las(tmp_path: Path, suffix: str) -> None:
 
 
 def test_copc_is_the_laz_that_it_is(tmp_path: Path) -> None:
-    """Chunks of different size, one per octree node, a record at the file's begin and one behind its points."""
+    """Chunks of different size, one per octree node, and records before and behind the points."""
     laspy, lazrs = pytest.importorskip("laspy"), pytest.importorskip("lazrs")
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales, header.offsets = [0.001] * 3, UTM

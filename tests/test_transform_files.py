@@ -142,6 +142,7 @@ def test_first_guesses_of_other_programs(tmp_path: Path, number: int) -> None:
         ('{"pipeline": [{"type": "filters.transformation", "matrix": "1 2 x"}]}', "x"),
         ("transform:\n  translation: {x: 1, y: 2}\n  rotation: {x: 0, y: 0, z: 0, w: 1}\n", "z"),
         ("static_transform_publisher 1 2 3 map scan", "3 numbers"),
+        ("# static_transform_publisher", "0 rows"),
         ("", "0 rows"),
         ("\0\0\0\0", "no text"),
         ("[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]", "shape"),

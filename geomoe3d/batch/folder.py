@@ -18,9 +18,11 @@ from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.journal import Journal
 
-RUN_FILE, JOURNAL_FILE, RESULTS_FILE = "run.json", "journal.jsonl", "results.jsonl"
+RUN_FILE, JOURNAL_FILE = "run.json", "journal.jsonl"
+RESULTS_FILE, TABLE_FILE = "results.jsonl", "results.csv"
 PAGE_FILE, TRANSFORMS_FOLDER = "page.html", "transforms"
 FORMAT = "geomoe3d batch 1"
+TABLE_HEAD = "id,status,confidence,overlap,"
 PAGE_MARK = '<meta name="generator" content="geomoe3d batch">'
 
 _KIND = "geomoe3d batch "
@@ -132,7 +134,8 @@ def remove_batch(folder: Path) -> None:
     if has_mark(folder / PAGE_FILE, PAGE_MARK):
         remove([folder / PAGE_FILE])
     # The last one says whose the others are.
-    remove([folder / name for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE)])
+    table = [folder / TABLE_FILE] if has_mark(folder / TABLE_FILE, TABLE_HEAD) else []
+    remove([*table, *(folder / name for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE))])
 
 
 def remove(paths: Iterable[Path]) -> None:

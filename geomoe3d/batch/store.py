@@ -2,12 +2,15 @@
 
 ``run.json`` holds the configuration and versions that decide every answer; a folder is only gone on with
 under the same. ``journal.jsonl`` gets one line as each pair is finished. ``results.jsonl`` is written in the
-end, in the order of the table and without times: the same bytes whoever worked on it.
+end, in the order of the table and without times: the same bytes whoever worked on it; ``results.csv`` is the
+same for spreadsheets.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 import os
 from collections.abc import Iterable
@@ -21,11 +24,15 @@ from geomoe3d.batch.folder import (
     JOURNAL_FILE,
     RESULTS_FILE,
     RUN_FILE,
+    TABLE_FILE,
+    TABLE_HEAD,
     check_can_be_folder,
     foreign,
+    has_mark,
     read_identity,
     remove_batch,
 )
+from geomoe3d.batch.table import MATRIX_COLUMNS
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import FormatError, InputError, OutputError
@@ -98,6 +105,8 @@ class BatchStore:
         for path in (folder / JOURNAL_FILE, folder / RESULTS_FILE):
             if path.exists() and (stored is None or not path.is_file()):
                 raise InputError(foreign(path))
+        if (folder / TABLE_FILE).exists() and not has_mark(folder / TABLE_FILE, TABLE_HEAD):
+            raise InputError(foreign(folder / TABLE_FILE))
         differing = [] if stored is None or fresh else differences(stored, self._identity)
         if differing:
             raise InputError(
@@ -170,8 +179,9 @@ class BatchStore:
             ) from None
 
     def write_results(self, records: Iterable[dict[str, Any]]) -> Path:
-        """All records in the given order, without what differs from run to run."""
+        """All records in the given order, without what differs from run to run; also as a table."""
         path = self.folder / RESULTS_FILE
+        records = list(records)
 
         def write(temporary: Path) -> None:
             with temporary.open("w", encoding="utf-8", newline="\n") as stream:
@@ -180,7 +190,28 @@ class BatchStore:
                     stream.write(json.dumps(kept, allow_nan=False, separators=(",", ":")) + "\n")
 
         write_atomically(path, write, force=True)
+        write_text(self.folder / TABLE_FILE, results_table(records), force=True)
         return path
+
+
+def results_table(records: Iterable[dict[str, Any]]) -> str:
+    """A row per pair for spreadsheets: id, status, confidence, overlap, the transform's 16 numbers, reasons.
+
+    Cells without a value are empty; in place of reasons stands the error of a pair that has no result.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*TABLE_HEAD.rstrip(",").split(","), *MATRIX_COLUMNS, "reasons"])
+    for record in records:
+        result = record["result"]
+        if result is None:
+            writer.writerow([record["id"], "error", *[""] * 18, record["error"]])
+            continue
+        matrix = [value for row in result["T_target_source"] for value in row]
+        numbers = [result["confidence"], result["overlap"], *matrix]
+        cells = ["" if value is None else repr(value) for value in numbers]
+        writer.writerow([record["id"], result["status"], *cells, "; ".join(result["reasons"])])
+    return out.getvalue()
 
 
 def _weights_hash(config: RegistrationConfig) -> str | None:

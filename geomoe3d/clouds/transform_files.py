@@ -165,7 +165,7 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
             T = parse_transform(data.decode("utf-8-sig", errors="replace"))
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
-    except (ValueError, EOFError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, EOFError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise FormatError(f"'{path}' holds no transform: {describe_error(error)}") from None
     if T.shape != (4, 4):
         raise FormatError(f"'{path}' holds numbers of shape {T.shape}, expected (4, 4)")

@@ -111,7 +111,7 @@ def parse_transform(text: str) -> FloatArray:
             if text.lstrip()[0] == "{":
                 raise
             text = text.replace("\n", " ")  # an array that numpy printed, perhaps over several lines
-    if "static_transform_publisher" in text:
+    if "static_transform_publisher" in re.sub(r"#.*", "", text):
         return _of_publisher(text)
     if re.search(r"^\s*(- )?(translation|position)\s*:", text, re.M):
         import yaml

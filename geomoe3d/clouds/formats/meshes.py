@@ -81,7 +81,8 @@ def read_mesh(path: Path) -> RawCloud:
         return mesh
     with path.open(encoding="latin-1") as handle:
         words = {line.split(None, 1)[0] for line in handle if line.strip()}
-    return replace(mesh, unread=tuple(name for word, name in _OBJ_WORDS.items() if word in words))
+    said = [name for word, name in _OBJ_WORDS.items() if word in words]
+    return replace(mesh, unread=tuple(dict.fromkeys((*said, *mesh.unread))))
 
 
 def _stl_size(path: Path) -> int | None:
@@ -132,6 +133,7 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
         FormatError: a face names a missing vertex.
     """
     parts = []
+    unread: list[str] = []
     for item, T in _placed(geometry):
         vertices = np.array(item.vertices, dtype=np.float64)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -146,6 +148,8 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
                 f"{what}: a face names vertex {faces.max()}, there are {len(vertices)} vertices"
             )
         parts.append(RawCloud(vertices, None, _vertex_colors(item), faces))
+        kind = str(getattr(item.visual, "kind", None))
+        unread += {"texture": ["texture coordinates", "materials"], "face": ["face colors"]}.get(kind, [])
     if not sum(len(part.points) for part in parts):
         raise EmptyCloudError(f"{what} holds 0 points: no mesh and no point cloud")
     if any(_num_faces(part) for part in parts):
@@ -157,6 +161,7 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
         np.concatenate([part.points for part in parts]),
         colors=np.concatenate(colors) if len(colors) == len(parts) else None,
         faces=faces if len(faces) else None,
+        unread=tuple(dict.fromkeys(unread)),
     )
 
 

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import torch
 
-from geomoe3d.networks.geomoe import GeoMoE
-from geomoe3d.networks.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.networks.build import Network, build_network
+from geomoe3d.networks.pretrained import WeightCard, load_network, save_pretrained
 from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, PACKAGED
 from geomoe3d.runtime.provenance import source_commit
+from geomoe3d.training.batches import open_training
 from geomoe3d.training.checkpoint import load_checkpoint
 from geomoe3d.training.config import load_train_config
 from geomoe3d.training.logs import read_csv
-from geomoe3d.training.pairs import ShardFolder
 
 NOTES = (
     "GeoMoE that judges motions; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
@@ -41,22 +41,22 @@ def main() -> None:
     run, path = given.run, given.out
     state = load_checkpoint(run / ("last.pt" if given.last else "best.pt"))
     config = load_train_config(str(run / "config.yaml"))
-    model = GeoMoE(config.network)
+    model = build_network(config.network)
     averaged = state.get("averaged")
     model.load_state_dict(averaged["model"] if given.last and averaged else state["model"])
     card = WeightCard(
         architecture={},
-        voxel_size=ShardFolder(config.data.train).voxel_sizes(),
+        voxel_size=open_training(config).voxel_sizes(),
         training_data=str(state.get("data", "")),
         steps=int(state["step"]),
         metrics=state.get("metrics", {}) if not given.last else last_metrics(run),
         commit=source_commit(),
-        notes=NOTES,
+        notes=NOTES if config.network.judges_motions else "",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     save_pretrained(path, model, card, force=True, half=True)
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, step {card.steps}, {card.metrics}")
-    print(f"verdicts move by up to {_moved(model.eval(), load_pretrained(path)[0]):.4f}")
+    print(f"verdicts move by up to {_moved(model.eval(), load_network(path)[0]):.4f}")
 
 
 def last_metrics(run: Path) -> dict[str, float]:
@@ -66,13 +66,16 @@ def last_metrics(run: Path) -> dict[str, float]:
 
 
 @torch.no_grad()
-def _moved(model: GeoMoE, rounded: GeoMoE) -> float:
-    """Largest change of a verdict on made-up channels."""
+def _moved(model: Network, rounded: Network) -> float:
+    """Largest change of a verdict on made-up input: on motions where the network judges some, else rows."""
     torch.manual_seed(0)
-    channels = torch.rand(16, 500, model.config.num_extra_channels) ** 3
+    width = model.config.num_extra_channels
+    channels = torch.rand(16, 500, width) ** 3 if width else None
     coordinates = torch.rand(16, 500, 6)
-    first, second = (net(coordinates, channels).verdict for net in (model, rounded))
-    return float((first - second).abs().max())
+    first, second = (net(coordinates, channels) for net in (model, rounded))
+    if first.verdict is not None and second.verdict is not None:
+        return float((first.verdict - second.verdict).abs().max())
+    return float((first.logits[-1] - second.logits[-1]).abs().max())
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ def draw(
         elif log:
             axes.xaxis.set_major_formatter("{x:g}")
         axes.grid(color=_LINE, clip_on=False)
-        axes.tick_params(length=0, which="both", labelcolor=_SOFT)
+        axes.tick_params(length=0, which="both", pad=6, labelcolor=_SOFT)
         axes.spines[:].set_visible(False)
         if diagonal:
             axes.plot(x, y, color=_SOFT, linestyle="dotted", clip_on=False)

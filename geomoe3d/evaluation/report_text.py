@@ -22,7 +22,7 @@ COLUMNS = {
     "rmse_recall": "RMSE\nrecall",
     "rotation_median": "rotation\ndeg",
     "translation_median": "transl.\ncm",
-    "verified_f1": "F1 by\ntransform",
+    "verified_f1": "inlier\nF1",
     "accepted": "accepted\n%",
     "accepted_right": "precision\nof ok",
     "time_median": "median\nms",
@@ -31,8 +31,8 @@ COLUMNS = {
 LEGEND = (
     "recall: % of pairs below 15 (20) deg and 0.30 m, mean over pairs with its 95 % interval; scene mean: "
     "mean over scenes of the former; RMSE recall: at most 0.20 m, pairs not consecutive; rotation, "
-    "translation: medians over right pairs; F1: inliers by the transform, mean over pairs, %; accepted: % of "
-    "pairs with status ok; precision: % of those that are right; -: not defined."
+    "translation: medians over right pairs; inlier F1: labels by the transform, mean over pairs, %; "
+    "accepted: % of pairs with status ok; precision: % of those that are right; -: not defined."
 )
 _LONGEST_ERROR = 300
 

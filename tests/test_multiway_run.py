@@ -298,7 +298,7 @@ def test_beginning_anew_removes_what_the_model_left_and_nothing_else(scanned_roo
     assert not (copied / "group7.ply").exists()
     model = register_scans(scans, copied, config=CONFIG, fresh=True, page=False)
     assert model.num_pairs == len(list(read_journal(copied / "pairs" / JOURNAL_FILE))) == 1
-    group = {f"group1.{suffix}" for suffix in ("tum.txt", "kitti.txt", "g2o", "ply")}
+    group = {f"group1.{suffix}" for suffix in ("tum.txt", "kitti.txt", "g2o", "gtsam.g2o", "ply")}
     tables = {"scans.csv", "edges.csv", "matrices"}
     assert {path.name for path in copied.iterdir()} == {"poses.json", "pairs", "notes.txt", *group, *tables}
     assert (copied / "pairs" / "notes.txt").read_text() == "mine"

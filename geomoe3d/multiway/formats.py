@@ -28,11 +28,12 @@ def kitti_text(poses: Sequence[FloatArray]) -> str:
     return "".join(" ".join(f"{value:.17g}" for value in T[:3].ravel()) + "\n" for T in poses)
 
 
-def g2o_text(poses: dict[int, FloatArray], edges: Sequence[Edge]) -> str:
+def g2o_text(poses: dict[int, FloatArray], edges: Sequence[Edge], *, half_turns: bool = True) -> str:
     """``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines; the first vertex is fixed.
 
     An edge i j of g2o measures X_i^-1 X_j, which is T_target_source with i the target and j the source. Its
-    information belongs to a small motion on the right, [translation, vector part of the quaternion].
+    information belongs to a small motion on the right, [translation, vector part of the quaternion], or with
+    ``half_turns`` False, as GTSAM reads it, [translation, turn].
     """
     lines = []
     for scan in sorted(poses):
@@ -40,19 +41,19 @@ def g2o_text(poses: dict[int, FloatArray], edges: Sequence[Edge]) -> str:
         lines.append(f"VERTEX_SE3:QUAT {scan} {_seven(T)}")
     lines.append(f"FIX {min(poses)}")
     for edge in edges:
-        information = right_information(edge)
+        information = right_information(edge, half_turns=half_turns)
         upper = " ".join(f"{information[r, c]:.10g}" for r in range(6) for c in range(r, 6))
         lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {_seven(edge.T_target_source)} {upper}")
     return "\n".join(lines) + "\n"
 
 
-def right_information(edge: Edge) -> FloatArray:
-    """(6, 6) information of an edge as g2o takes it: order [translation, half turn], motion on the right.
+def right_information(edge: Edge, *, half_turns: bool = True) -> FloatArray:
+    """(6, 6) information of an edge in the order [translation, turn], motion on the right.
 
-    g2o counts a turn by the vector part of a quaternion, half of it. GTSAM reads the same file in full turns,
-    so that rotations weigh four times what is meant there.
+    g2o counts a turn by the vector part of a quaternion, half of it. GTSAM reads the same file in full turns:
+    what is meant for g2o would make rotations weigh four times as much there.
     """
-    scale = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+    scale = np.diag([2.0 if half_turns else 1.0] * 3 + [1.0] * 3)
     order = [3, 4, 5, 0, 1, 2]
     information: FloatArray = (scale @ source_information(edge) @ scale)[np.ix_(order, order)]
     return information

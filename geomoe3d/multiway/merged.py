@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.ply import write_ply
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.prepare import voxel_keys
-from geomoe3d.errors import DependencyError
 from geomoe3d.geometry.se3 import shift_frames, transform_points
-from geomoe3d.multiway.formats import quaternion
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
@@ -89,9 +86,7 @@ def write_merged(path: Path, cloud: RawCloud) -> None:
 
 
 def write_e57(path: Path, scans: Sequence[tuple[str, str, FloatArray]]) -> None:
-    """All scans of a group in one file, every point as given, each scan with its pose.
-
-    Coordinates are single precision about each scan's own origin; the pose, which is double, brings it back.
+    """All scans of a group in one file, every finite point as given, each scan with its pose; all in doubles.
 
     Args:
         path: replaced if there.
@@ -101,32 +96,11 @@ def write_e57(path: Path, scans: Sequence[tuple[str, str, FloatArray]]) -> None:
         DependencyError: pye57 is not installed.
         OutputError: the file cannot be written.
     """
-    pye57 = e57_library()
 
-    def write(temporary: Path) -> None:
-        with pye57.E57(str(temporary), mode="w") as file:
-            for name, source, T in scans:
-                cloud = load_points(source)
-                local = shift_frames(T, -cloud.origin, np.zeros(3))  # of the points as they are held here
-                x, y, z, w = quaternion(local[:3, :3])
-                columns = {f"cartesian{axis}": cloud.points[:, k] for k, axis in enumerate("XYZ")}
-                if cloud.colors is not None:
-                    for k, color in enumerate(("Red", "Green", "Blue")):
-                        columns[f"color{color}"] = np.rint(255 * cloud.colors[:, k]).astype(np.uint8)
-                file.write_scan_raw(
-                    columns, name=name, rotation=np.array([w, x, y, z]), translation=local[:3, 3]
-                )
+    def posed() -> Iterator[tuple[str, RawCloud, FloatArray]]:
+        for name, source, T in scans:
+            cloud = load_points(source)
+            local = shift_frames(T, -cloud.origin, np.zeros(3))  # of the points as they are held here
+            yield name, RawCloud(cloud.points, cloud.normals, cloud.colors), local
 
-    write_atomically(path, write, force=True)
-
-
-def e57_library() -> Any:
-    """The module pye57.
-
-    Raises:
-        DependencyError: it is not installed.
-    """
-    try:
-        return importlib.import_module("pye57")
-    except ImportError:
-        raise DependencyError("E57 files need pye57, which is not installed: pip install pye57") from None
+    write_atomically(path, lambda temporary: write_scans(temporary, posed()), force=True)

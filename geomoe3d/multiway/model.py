@@ -37,7 +37,7 @@ _POSE_MARK = "geomoe3d multiway pose: p_reference = R p_scan + t"
 POSES_FILE, PAGE_FILE = "poses.json", "page.html"
 PAGE_MARK = '<meta name="generator" content="geomoe3d multiway">'
 _FORMAT, _KIND = "geomoe3d scene 2", "geomoe3d scene "
-_GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|g2o|ply|e57)")
+_GROUP_FILE = re.compile(r"group\d+\.(tum\.txt|kitti\.txt|(gtsam\.)?g2o|ply|e57)")
 _OFTEN_NO_CLOUDS = {".txt", ".csv", ".asc", ".bin", ".npy", ".npz"}
 
 
@@ -340,7 +340,9 @@ def write_model(model: SceneModel, merged_voxel_size: float | None, *, e57: bool
             prefix.with_suffix(".tum.txt"), tum_text(names, [number[n] for n in names], poses), force=True
         )
         write_text(prefix.with_suffix(".kitti.txt"), kitti_text(poses), force=True)
-        write_text(prefix.with_suffix(".g2o"), g2o_text(group.local_poses, group.edges), force=True)
+        graph = group.local_poses, group.edges
+        write_text(prefix.with_suffix(".g2o"), g2o_text(*graph), force=True)
+        write_text(prefix.with_suffix(".gtsam.g2o"), g2o_text(*graph, half_turns=False), force=True)
         merged = merge_clouds(
             [paths[n] for n in names],
             [number[n] for n in names],

@@ -18,6 +18,7 @@ from geomoe3d.batch.memory import worker_bytes_of_any
 from geomoe3d.batch.run import Labour, try_out
 from geomoe3d.batch.store import BatchStore
 from geomoe3d.batch.task import Settings
+from geomoe3d.clouds.formats.e57 import require_pye57
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
 from geomoe3d.filters.base import resolved
@@ -26,7 +27,6 @@ from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
 from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
 from geomoe3d.multiway.defaults import NEIGHBORS as NEIGHBORS
 from geomoe3d.multiway.initial import InitialPoses, read_poses
-from geomoe3d.multiway.merged import e57_library
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
@@ -105,7 +105,7 @@ def register_scans(
     if merged_voxel_size is not None and not merged_voxel_size > 0:
         raise InputError(f"merged_voxel_size is {merged_voxel_size}, it must be positive")
     if e57:
-        e57_library()
+        require_pye57()
     paths, folder = as_paths(scans), Path(out)
     labour = Labour(workers, scheduler, cache)
     labour.check()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -184,12 +184,12 @@ def write_e57(handle: BinaryIO, cloud: RawCloud) -> tuple[str, ...]:
     return write_scans(Path(handle.name), [("cloud", cloud, np.eye(4))])
 
 
-def write_scans(path: Path, scans: Sequence[tuple[str, RawCloud, FloatArray]]) -> tuple[str, ...]:
+def write_scans(path: Path, scans: Iterable[tuple[str, RawCloud, FloatArray]]) -> tuple[str, ...]:
     """An E57 file of posed scans: double coordinates, 8 bit colours, normals, intensity and time.
 
     Args:
         path: replaced if it is there.
-        scans: name, points in the scan's own frame, and pose (4, 4): p_file = R p_scan + t.
+        scans: name, points in the scan's own frame, and pose (4, 4): p_file = R p_scan + t; taken one by one.
 
     Returns:
         Names of what the scans hold and E57 has no place for.
@@ -204,8 +204,7 @@ def write_scans(path: Path, scans: Sequence[tuple[str, RawCloud, FloatArray]]) -
     lost: list[str] = []
     with pye57.E57(str(path), mode="w") as file:
         image = file.image_file
-        if any(cloud.normals is not None for _, cloud, _ in scans):
-            image.extensionsAdd("nor", _SURFACE_NORMALS)
+        image.extensionsAdd("nor", _SURFACE_NORMALS)
 
         def structure(parent: Any, name: str, values: dict[str, float]) -> None:
             node = lib.StructureNode(image)

@@ -103,4 +103,7 @@ def write_e57(path: Path, scans: Sequence[tuple[str, str, FloatArray]]) -> None:
             local = shift_frames(T, -cloud.origin, np.zeros(3))  # of the points as they are held here
             yield name, RawCloud(cloud.points, cloud.normals, cloud.colors), local
 
-    write_atomically(path, lambda temporary: write_scans(temporary, posed()), force=True)
+    def write(temporary: Path) -> None:
+        write_scans(temporary, posed())
+
+    write_atomically(path, write, force=True)

@@ -11,7 +11,7 @@ import difflib
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from geomoe3d.errors import ConfigError
 
@@ -23,6 +23,19 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 
+    def __hash__(self) -> int:
+        """Of the values; options of parts are mappings, which have no hash of their own."""
+        return hash(self.model_dump_json())
+
+
+class PartConfig(Section):
+    """What every section of a part holds: which part, and the settings of a user's own."""
+
+    name: str
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="settings of a part of your own: keyword arguments of its class"
+    )
+
 
 class PreparationConfig(Section):
     """From a raw cloud to voxel points with oriented normals."""
@@ -33,8 +46,6 @@ class PreparationConfig(Section):
     )
     normal_radius: float = Field(2.0, gt=0, description="neighbourhood of a normal, in voxels")
     normal_neighbors: int = Field(30, ge=3, description="at most so many points fit a normal")
-    feature_radius: float = Field(5.0, gt=0, description="neighbourhood of FPFH, in voxels")
-    feature_neighbors: int = Field(100, ge=3, description="at most so many points make a feature")
     viewpoint: Literal["auto", "origin", "guess", "centroid"] = Field(
         "auto",
         description="where the sensor stood, to which normals turn: the file's origin, a guess from what can "
@@ -42,55 +53,55 @@ class PreparationConfig(Section):
     )
 
 
-class MatchingConfig(Section):
-    """Nearest neighbours in feature space."""
+class DescriptorConfig(PartConfig):
+    """What describes the surface around each point in numbers that can be compared."""
 
-    method: Literal["one_way", "mutual", "ratio"] = Field(
+    name: str = Field("fpfh", description="fpfh, or a class of your own: file.py:Class or module:Class")
+    radius: float = Field(5.0, gt=0, description="neighbourhood of a feature, in voxels")
+    neighbors: int = Field(100, ge=3, description="at most so many points make a feature")
+
+
+class MatchingConfig(PartConfig):
+    """From features to putative correspondences."""
+
+    name: str = Field(
         "one_way",
-        description="keep each source point's nearest target, only where that is mutual, or only where the "
-        "second best is clearly worse",
+        description="one_way keeps each source point's nearest target, mutual only where that is mutual, ratio "
+        "only where the second best is clearly worse; or a class of your own",
     )
     neighbors: int = Field(1, ge=1, le=10, description="targets kept per source point")
-    max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by method ratio")
+    max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by ratio")
     max_correspondences: int = Field(
         1000, ge=3, description="at most so many are used: mutual ones first, then a seeded choice"
     )
 
 
-class FilterConfig(Section):
-    """What weighs the correspondences before estimation."""
+class FilterConfig(PartConfig):
+    """Outlier rejection: what weighs the correspondences before transforms are proposed."""
 
     name: str = Field(
-        "auto",
-        description="none, spectral (needs no training), geomoe (the network), or auto: geomoe where "
-        "weights are given or torch is installed, else none",
+        "none",
+        description="none, spectral (needs no training), geomoe (a network that weighs correspondences, given "
+        "its weights), or a class of your own",
     )
-    weights: str | None = Field(
-        None, description="trained weights of geomoe: a .safetensors file or a shipped name"
-    )
-
-    @model_validator(mode="after")
-    def _check(self) -> FilterConfig:
-        if self.weights is not None and self.name not in ("auto", "geomoe"):
-            raise ValueError(f"weights '{self.weights}' are given, but the filter '{self.name}' takes none")
-        return self
+    weights: str | None = Field(None, description="trained weights of the filter: a .safetensors file")
 
 
-class EstimatorConfig(Section):
-    """From weighted correspondences to candidate motions."""
+class EstimatorConfig(PartConfig):
+    """From weighted correspondences to candidate transforms."""
 
-    name: Literal["consensus", "ransac", "svd"] = Field(
+    name: str = Field(
         "consensus",
         description="consensus: sets that preserve lengths and planes; ransac: random samples; svd: one "
-        "least squares fit, for correspondences that are nearly all right",
+        "least squares fit, for correspondences that are nearly all right; or a class of your own",
     )
     inlier_threshold: float = Field(2.0, gt=0, description="largest residual of an inlier, in voxels")
     num_hypotheses: int = Field(20, ge=1, description="distinct hypotheses that consensus keeps by round")
     num_aligned: int = Field(
         6,
         ge=0,
-        description="so many of them, best first, are drawn closer by the keypoints of both scans (by geomoe "
-        "of those it looks at); correspondences without clouds only, since clouds do it better",
+        description="so many of them, best first, are drawn closer by the keypoints of both scans (where a "
+        "network scores, of those it looks at); correspondences without clouds only, since clouds do it better",
     )
     one_way_weight: float = Field(
         0.5, ge=0, le=1, description="weight of a match that is not mutual beside 1 for one that is"
@@ -102,10 +113,21 @@ class EstimatorConfig(Section):
     )
 
 
-class VerificationConfig(Section):
-    """Re-scoring of the hypotheses against the clouds themselves."""
+class ScoringConfig(Section):
+    """Who scores the hypotheses; the product of what they say decides."""
 
-    enabled: bool = Field(True, description="without it the correspondences alone choose the answer")
+    scorers: tuple[str, ...] | Literal["auto"] = Field(
+        "auto",
+        description="surfaces: how well the clouds lie on each other; network: what a trained network says of "
+        "the best few; classes of your own. auto: surfaces, and network where torch is installed. []: none, "
+        "the estimator's first hypothesis is the answer",
+    )
+    weights: str | None = Field(
+        None, description="trained weights of network: a .safetensors file or a shipped name"
+    )
+    options: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="settings of scorers of your own, by their names"
+    )
 
 
 class SecondLookConfig(Section):
@@ -148,19 +170,19 @@ class SecondLookConfig(Section):
         return grids
 
 
-class RefinementConfig(Section):
-    """Local refinement of the chosen hypothesis on the clouds."""
+class RefinementConfig(PartConfig):
+    """Refinement of the best hypotheses."""
 
-    method: Literal["none", "icp", "gicp"] = Field(
+    name: str = Field(
         "gicp",
-        description="how the chosen motion is polished: icp is point-to-plane; gicp came two to four times "
-        "closer on generated scans at the same cost",
+        description="icp is point-to-plane; gicp came two to four times closer on generated scans at the same "
+        "cost; svd fits the weighted correspondences anew and needs no clouds; none; or a class of your own",
     )
     max_distance: float = Field(1.5, gt=0, description="largest distance of matched points, in voxels")
     max_iterations: int = Field(30, ge=1, description="most steps of the refinement")
 
 
-class JudgementConfig(Section):
+class DecisionConfig(Section):
     """When an answer may be called ok."""
 
     min_confidence: float = Field(0.95, ge=0, le=1, description="below it the status is low_confidence")
@@ -175,13 +197,26 @@ class RegistrationConfig(Section):
     voxel_size: float | None = Field(None, gt=0, description="cloud units; None chooses and reports one")
     seed: int = Field(0, ge=0, description="same files, same seed: same answer")
     preparation: PreparationConfig = PreparationConfig()
+    descriptor: DescriptorConfig = DescriptorConfig()
     matching: MatchingConfig = MatchingConfig()
     filter: FilterConfig = FilterConfig()
     estimator: EstimatorConfig = EstimatorConfig()
-    verification: VerificationConfig = VerificationConfig()
-    second_look: SecondLookConfig = SecondLookConfig()
+    scoring: ScoringConfig = ScoringConfig()
     refinement: RefinementConfig = RefinementConfig()
-    judgement: JudgementConfig = JudgementConfig()
+    second_look: SecondLookConfig = SecondLookConfig()
+    decision: DecisionConfig = DecisionConfig()
+
+
+_MOVED = {
+    "judgement": "decision",
+    "verification": "scoring",
+    "verification.enabled": "scoring.scorers ([] for false)",
+    "preparation.feature_radius": "descriptor.radius",
+    "preparation.feature_neighbors": "descriptor.neighbors",
+    "matching.method": "matching.name",
+    "refinement.method": "refinement.name",
+}
+"""Keys of version 0.1.0 and where they stand now."""
 
 
 def known_keys(section: type[Section], prefix: str = "") -> list[str]:
@@ -276,7 +311,8 @@ def _explain(error: ValidationError, section: type[Section]) -> str:
     for problem in error.errors():
         key = ".".join(str(part) for part in problem["loc"])
         if problem["type"] == "extra_forbidden":
-            parts.append(f"unknown key '{key}'; {_nearest(key, known_keys(section))}")
+            hint = f"it is now {_MOVED[key]}" if key in _MOVED else _nearest(key, known_keys(section))
+            parts.append(f"unknown key '{key}'; {hint}")
         elif problem["type"] in ("model_type", "model_attributes_type"):
             parts.append(f"'{key}' is a section, found {problem['input']!r}; did you mean {key}.name?")
         else:

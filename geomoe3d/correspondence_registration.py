@@ -1,26 +1,39 @@
-"""Bare correspondences in, a motion out: filter and estimator without clouds to verify anything on.
+"""Bare correspondences in, a transform out: the line without clouds to score anything on.
 
-Place: beside `registration`, for whoever has features and matches of their own. The stages weigh and solve
-are the same; what follows them there, verification and with it the confidence, needs the clouds.
+Place: beside `registration`, for whoever has features and matches of their own. Outlier rejection and proposing
+are the same; a network scores the first few hypotheses, drawn closer by the keypoints; what follows in
+registration, scoring by the clouds and with it the confidence, needs them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.clouds.viewpoint import believed_viewpoints
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError
-from geomoe3d.estimators.base import Estimator, make_estimator
-from geomoe3d.estimators.proposals import solve
-from geomoe3d.filters.base import Filter, make_filter, resolved
+from geomoe3d.estimators.keypoint_alignment import KeypointAligner
+from geomoe3d.estimators.proposals import propose
 from geomoe3d.geometry.se3 import residuals, shift_frames
+from geomoe3d.pipeline import Pipeline, resolved
+from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray
+from geomoe3d.scoring.network import NETWORK, opinion_of
+from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray, Hypothesis, PreparedCloud
+
+MOST_LOOKED_AT = 6
+"""Hypotheses that a network looks at."""
+FIRST_LOOKED_AT = 2
+"""Hypotheses that it looks at before it is asked whether it has seen enough."""
+CONVINCED = 3.0
+"""Verdict from which on no further hypotheses are looked at."""
+MOST_ROWS = 1000
+"""Correspondences that a hypothesis is scored on; mutual ones first where there are more."""
 
 
 @dataclass(frozen=True)
@@ -60,23 +73,28 @@ class CorrespondenceResult:
         return int(self.inliers.sum())
 
 
-class CorrespondenceSolver:
-    """The filter and the estimator of a configuration; keep it to load weights only once.
+class CorrespondenceRegistrar:
+    """Registers bare correspondences with one configuration; keep it to load weights only once.
 
     Args:
         config: complete configuration; None takes the defaults.
 
     Raises:
-        ConfigError: an unknown filter or estimator.
+        ConfigError: an unknown part, or settings that it does not take.
         CheckpointError: trained weights are missing, broken or do not fit.
-        DependencyError: a library that the filter needs is not installed.
+        DependencyError: a library that a part needs is not installed.
     """
 
     def __init__(self, config: RegistrationConfig | None = None) -> None:
-        self.config = resolved(config)
-        chosen = self.config.filter
-        self.filter: Filter = make_filter(chosen.name, chosen.weights, self.config.estimator)
-        self._estimator: Estimator = make_estimator(self.config.estimator)
+        self.pipeline = Pipeline(resolved(config))
+        self.pipeline.warm_up()
+
+    @classmethod
+    def of(cls, pipeline: Pipeline) -> CorrespondenceRegistrar:
+        """With parts that somebody has made already."""
+        made = cls.__new__(cls)
+        made.pipeline = pipeline
+        return made
 
     def __call__(
         self,
@@ -94,28 +112,76 @@ class CorrespondenceSolver:
             inlier_threshold: cloud units; None takes that of the configuration.
             seed: None takes that of the configuration.
         """
+        config, clock = self.pipeline.config, StageClock()
         rows = check_rows(correspondences)
         voxel_size = check_length(voxel_size, "voxel_size")
-        threshold = self.config.estimator.inlier_threshold * voxel_size
+        threshold = config.estimator.inlier_threshold * voxel_size
         if inlier_threshold is not None:
             threshold = check_length(inlier_threshold, "inlier_threshold")
-        seed = self.config.seed if seed is None else seed
         nothing = np.full((4, 4), np.nan), np.zeros(len(rows), dtype=np.bool_), threshold
         if len(rows) < 3:
             return CorrespondenceResult(*nothing, FilterOutput(np.zeros(len(rows))))
-        clock = StageClock()
-        clock("weigh")
         matched, origins = localised(rows)
-        weighed = self.filter(matched, voxel_size=voxel_size, seed=seed)
-        clock("solve")
-        estimator = self.config.estimator
-        found = solve(self._estimator, matched, weighed, estimator, inlier_threshold=threshold, seed=seed)
+        pair = Pair(matched, voxel_size, threshold, config.seed if seed is None else seed)
+        found, weighed = self.hypotheses(pair, clock)
+        if found and not self.pipeline.refiner.needs_clouds:
+            clock("refine")
+            refined, _ = self.pipeline.refiner.about(pair)(found[0])
+            found = [] if refined is None else [Hypothesis(refined)]
         seconds = clock.stop()
         if not found:
             return CorrespondenceResult(*nothing, weighed, seconds=seconds)
         inliers = residuals(found[0].T_target_source, matched.source, matched.target) < threshold
         motions = [shift_frames(hypothesis.T_target_source, *origins) for hypothesis in found]
         return CorrespondenceResult(motions[0], inliers, threshold, weighed, tuple(motions[1:]), seconds)
+
+    def weigh(self, correspondences: ArrayLike | Correspondences, voxel_size: float) -> FilterOutput:
+        """What the outlier filter, or a network under the best transform, says of correspondences (N, 6)."""
+        config = self.pipeline.config
+        rows, voxel_size = check_rows(correspondences), check_length(voxel_size, "voxel_size")
+        matched = localised(rows)[0] if len(rows) else Correspondences(rows)
+        pair = Pair(matched, voxel_size, config.estimator.inlier_threshold * voxel_size, config.seed)
+        if NETWORK in self.pipeline.scorers:
+            return self.hypotheses(pair, StageClock())[1]
+        return self.pipeline.weigh(pair)
+
+    @single_blas_thread()
+    def hypotheses(self, pair: Pair, clock: StageClock) -> tuple[list[Hypothesis], FilterOutput]:
+        """Best first, and weights of the correspondences: of the filter, or of the network under the best."""
+        line, matched = self.pipeline, pair.matched
+        network = line.scorers.get(NETWORK)
+        if line.filter is not None:
+            clock("filter")
+        weighed = line.weigh(pair)
+        clock("propose")
+        if network is None:
+            return propose(line.estimator, pair, weighed.weights, line.config.estimator), weighed
+        settings = line.config.estimator
+        num_aligned = settings.num_aligned if matched.normals is None else 0
+        estimate = line.estimator.with_less_effort() if num_aligned else line.estimator
+        # Only those that the network looks at are drawn closer, below.
+        found = propose(estimate, pair, weighed.weights, settings.model_copy(update={"num_aligned": 0}))
+        if not found:
+            return [], FilterOutput(np.zeros(len(matched)))
+        clock("score")
+        few = likeliest_rows(matched, MOST_ROWS, pair.seed)
+        surfaces = pair.keypoint_surfaces if few is matched else None
+        aligner = KeypointAligner(matched.points, pair.inlier_threshold, surfaces)
+        say = network.about(pair if few is matched else replace(pair, matched=few))
+        looked_at: list[Hypothesis] = []
+        for lot in (found[:FIRST_LOOKED_AT], found[FIRST_LOOKED_AT:MOST_LOOKED_AT]):
+            if lot and all(_verdict(h) < CONVINCED for h in looked_at):
+                count = max(num_aligned - len(looked_at), 0)
+                lot = aligner.hypotheses(lot[:count]) + lot[count:]
+                for hypothesis, said in zip(lot, say(_transforms(lot)), strict=True):
+                    hypothesis.scores[NETWORK] = said
+                looked_at += lot
+        ranked = sorted(looked_at, key=lambda h: -_verdict(h))
+        if few is not matched:  # scored on some rows, weighed on all
+            (ranked[0].scores[NETWORK],) = network.about(pair)(_transforms(ranked[:1]))
+        opinion = opinion_of(ranked[0])
+        output = None if opinion is None else opinion.output
+        return [*ranked, *found[len(looked_at) :]], output or weighed
 
 
 def register_correspondences(
@@ -141,9 +207,9 @@ def register_correspondences(
 
     Raises:
         InputError: no (N, 6) of finite numbers, or a voxel size that is not a positive length.
-        ConfigError, CheckpointError, DependencyError: as `CorrespondenceSolver`.
+        ConfigError, CheckpointError, DependencyError: as `CorrespondenceRegistrar`.
     """
-    return CorrespondenceSolver(config)(correspondences, voxel_size=voxel_size)
+    return CorrespondenceRegistrar(config)(correspondences, voxel_size=voxel_size)
 
 
 def localised(rows: FloatArray) -> tuple[Correspondences, tuple[FloatArray, FloatArray]]:
@@ -151,6 +217,48 @@ def localised(rows: FloatArray) -> tuple[Correspondences, tuple[FloatArray, Floa
     origins = choose_origin(rows[:, :3]), choose_origin(rows[:, 3:])
     local = rows - np.concatenate(origins)
     return Correspondences(local, viewpoints=believed_viewpoints(local, origins)), origins
+
+
+def between_clouds(
+    correspondences: ArrayLike | Correspondences, clouds: tuple[PreparedCloud, PreparedCloud]
+) -> Correspondences:
+    """A user's rows (N, 6), file coordinates, in the clouds' local ones, with the normals of the nearest points.
+
+    Raises:
+        InputError: no (N, 6) of finite numbers.
+    """
+    from scipy.spatial import cKDTree
+
+    rows = check_rows(correspondences)
+    local = rows - np.concatenate([cloud.origin for cloud in clouds])
+    source, target = clouds
+    nearest = [
+        np.asarray(cKDTree(cloud.points).query(side)[1], dtype=np.int64)
+        for cloud, side in zip(clouds, np.hsplit(local, 2), strict=True)
+    ]
+    return replace(Correspondences.between(source, target, *nearest), points=local)
+
+
+def _transforms(hypotheses: list[Hypothesis]) -> FloatArray:
+    return np.array([h.T_target_source for h in hypotheses])
+
+
+def _verdict(hypothesis: Hypothesis) -> float:
+    opinion = opinion_of(hypothesis)
+    return -np.inf if opinion is None else opinion.verdict
+
+
+def likeliest_rows(correspondences: Correspondences, limit: int, seed: int) -> Correspondences:
+    """At most ``limit`` correspondences in their order: mutual ones first, a seeded choice among equals.
+
+    The same object where there are no more.
+    """
+    if len(correspondences) <= limit:
+        return correspondences
+    chosen = np.random.default_rng(seed).permutation(len(correspondences))
+    if correspondences.mutual is not None:
+        chosen = chosen[np.argsort(~correspondences.mutual[chosen], kind="stable")]
+    return correspondences.take(np.sort(chosen[:limit]))
 
 
 def check_rows(correspondences: ArrayLike | Correspondences) -> FloatArray:

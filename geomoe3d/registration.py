@@ -1,82 +1,37 @@
-"""The method on one screen: load, prepare, describe, match, weigh, solve, verify, refine, judge.
+"""The method on one screen: load, prepare, features, match, propose, score, refine, decide.
 
-A network that judges motions weighs after the clouds have verified what was proposed, see `_shows_motions`.
+`Registrar._look` is the line; each of its words is a room. For correspondences without clouds there is
+`geomoe3d.correspondence_registration`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.io import load_points
-from geomoe3d.clouds.prepare import (
-    bounded_voxel_size,
-    check_cloud,
-    choose_voxel_size,
-    prepare,
-    scale_mismatch,
-)
+from geomoe3d.clouds.pair import Pair
+from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size, scale_mismatch
 from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.correspondence_registration import check_length, check_rows, localised
-from geomoe3d.decision.answer import Findings, failed_result, finished_result
+from geomoe3d.correspondence_registration import CorrespondenceRegistrar, between_clouds
+from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.confidence import Judgement
+from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.remarks import remarks
-from geomoe3d.decision.selection import Chooser
-from geomoe3d.errors import ConfigError, EmptyCloudError
-from geomoe3d.estimators.base import Estimator, make_estimator
-from geomoe3d.estimators.proposals import solve
-from geomoe3d.features.cache import DescriptionCache
-from geomoe3d.features.fpfh import describe, flip_pair
-from geomoe3d.filters.base import Filter, FilterOutput, make_filter, resolved
-from geomoe3d.matching.nearest import match
+from geomoe3d.decision.selection import Selection
+from geomoe3d.errors import ConfigError
+from geomoe3d.features.cache import FeatureCache
+from geomoe3d.pipeline import Clouds, Pipeline, Places, resolved, with_weights
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import Progress, StageClock
-from geomoe3d.types import BoolArray, Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
-
-if TYPE_CHECKING:
-    from geomoe3d.filters.motion_judge import Judged, PairJudge
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A result with what led to it, for pictures and for curious users.
-
-    Attributes:
-        result: the answer.
-        source, target: the clouds as loaded, full resolution, local coordinates.
-        correspondences: what was given to the estimator, local coordinates; empty where it never came to it.
-        weighed: what the filter said of them, in the same order; of a network that judges motions, what it
-            said under the answer, all zero where there was none.
-        inliers: (K,) True where a correspondence agrees with the answer.
-    """
-
-    result: RegistrationResult
-    source: PointCloud
-    target: PointCloud
-    correspondences: Correspondences = field(default_factory=lambda: Correspondences(np.zeros((0, 6))))
-    weighed: FilterOutput = field(default_factory=lambda: FilterOutput(np.zeros(0)))
-    inliers: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-
-    @property
-    def weights(self) -> FloatArray:
-        """(K,) the filter's weights."""
-        return self.weighed.weights
-
-
-class _Look(NamedTuple):
-    """What a pair was seen as, and what was found in it."""
-
-    described: tuple[PreparedCloud, PreparedCloud]
-    matched: Correspondences
-    weighed: FilterOutput
-    findings: Findings
+from geomoe3d.scoring.network import NETWORK, opinion_of
+from geomoe3d.types import Correspondences, FilterOutput, FloatArray, PointCloud
 
 
 class Registrar:
@@ -84,30 +39,24 @@ class Registrar:
 
     Args:
         config: complete configuration; None takes the defaults.
-        cache: keeps described clouds, for clouds that are in many pairs; answers are the same without it.
+        cache: keeps features of clouds that are in many pairs; answers are the same without it.
 
     Raises:
-        ConfigError: an unknown filter or estimator.
+        ConfigError: an unknown part, or settings that it does not take.
         CheckpointError: trained weights are missing, broken or do not fit.
-        DependencyError: a library that the filter needs is not installed.
+        DependencyError: a library that a part needs is not installed.
     """
 
     def __init__(
-        self, config: RegistrationConfig | None = None, *, cache: DescriptionCache | None = None
+        self, config: RegistrationConfig | None = None, *, cache: FeatureCache | None = None
     ) -> None:
         self.config = resolved(config)
-        self._cache = cache
-        self._filter: Filter = make_filter(
-            self.config.filter.name, self.config.filter.weights, self.config.estimator
-        )
-        network = getattr(self._filter, "config", None)
-        self._wants_ratio = "ratio" in getattr(network, "extra_channels", ())
-        self._judge: Callable[..., PairJudge] | None = getattr(self._filter, "about", None)
-        self._estimator: Estimator = make_estimator(self.config.estimator)
+        self.pipeline = Pipeline(self.config, cache)
+        self.pipeline.warm_up()
 
     @classmethod
     def from_pretrained(cls, name_or_path: str, config: RegistrationConfig | None = None) -> Registrar:
-        """A registrar whose correspondences are weighed by a trained network.
+        """A registrar with a trained network: as scorer, or as outlier filter where it weighs correspondences.
 
         Args:
             name_or_path: a .safetensors file with its card, or the name of shipped weights.
@@ -116,9 +65,7 @@ class Registrar:
         Raises:
             CheckpointError: the weights are missing, broken or do not fit.
         """
-        tree = (config or RegistrationConfig()).model_dump()
-        tree["filter"] = {"name": "geomoe", "weights": str(name_or_path)}
-        return cls(build_config(RegistrationConfig, tree, "Registrar.from_pretrained"))
+        return cls(with_weights(config or RegistrationConfig(), str(name_or_path)))
 
     def register(
         self,
@@ -126,10 +73,12 @@ class Registrar:
         target: Any,
         *,
         initial: ArrayLike | None = None,
+        correspondences: ArrayLike | None = None,
         progress: Progress | None = None,
     ) -> RegistrationResult:
-        """The rigid motion that lays source on target; see `geomoe3d.register`."""
-        return self.explain(source, target, initial=initial, progress=progress).result
+        """The transform that maps source into target; see `geomoe3d.register`."""
+        given: dict[str, Any] = {"initial": initial, "correspondences": correspondences}
+        return self.explain(source, target, **given, progress=progress).result
 
     def register_many(self, pairs: Iterable[tuple[Any, Any]]) -> Iterator[RegistrationResult]:
         """One result per (source, target), in order, as they are finished.
@@ -151,9 +100,7 @@ class Registrar:
         Raises:
             InputError: wrong shape, non-finite numbers, or no positive length.
         """
-        rows, voxel_size = check_rows(correspondences), check_length(voxel_size, "voxel_size")
-        given = localised(rows)[0] if len(rows) else Correspondences(rows)
-        return self._filter(given, voxel_size=voxel_size, seed=self.config.seed).weights
+        return CorrespondenceRegistrar.of(self.pipeline).weigh(correspondences, voxel_size).weights
 
     def explain(
         self,
@@ -161,14 +108,18 @@ class Registrar:
         target: Any,
         *,
         initial: ArrayLike | None = None,
+        correspondences: ArrayLike | None = None,
         progress: Progress | None = None,
     ) -> Explanation:
-        """`register` with the correspondences and weights behind the answer."""
+        """`register` with what led to the answer.
+
+        Arguments and errors are those of `geomoe3d.register`.
+        """
         config, seed, clock = self.config, self.config.seed, StageClock(progress)
-        if initial is not None and not config.verification.enabled:
+        if initial is not None and not config.scoring.scorers:
             raise ConfigError(
-                "verification weighs a first guess against the hypotheses, but verification.enabled is "
-                "false; leave one of the two out"
+                "a first guess is weighed against the hypotheses by scorers, but scoring.scorers is empty; leave "
+                "one of the two out"
             )
         clock("load")
         clouds = _load(source, "source", seed), _load(target, "target", seed)
@@ -180,206 +131,81 @@ class Registrar:
         clock("prepare")
         wanted = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
-        threshold = config.estimator.inlier_threshold * voxel_size
-        described = self.describe(*clouds, voxel_size, clock)
+        views = find_viewpoints(*clouds, config.preparation.viewpoint)
+        prepared = (
+            self.pipeline.prepare(clouds[0], voxel_size, views[0], clock),
+            self.pipeline.prepare(clouds[1], voxel_size, views[1], clock),
+        )
         # Known places, not guessed ones: the network was trained on true ones, or none.
-        viewpoints = known_viewpoints(*clouds, config.preparation.viewpoint)
-        seen = self._look(described, viewpoints, initial, clock)
-        if viewpoints is None and self._asks_flipped(seen.findings.judgement):
-            clock("describe")
-            other = self._look(described, None, initial, clock, rivals=seen.findings)
-            if other.findings.judgement.confidence > seen.findings.judgement.confidence:
-                seen = other
-        described, matched, weighed, findings = seen
-        given = (source, target), described, wanted, viewpoints is not None
-        for remark in remarks(*given, config.preparation, findings.judgement):
-            findings = findings.with_note(remark)
-        if self._shows_motions:  # nothing weighs anything where no motion was found
-            weighed = findings.weighed or FilterOutput(np.zeros(len(matched)))
-        result = finished_result(described, matched, findings, config, threshold, clock.stop())
-        inliers = findings.residuals(matched) < threshold
-        return Explanation(result, *clouds, matched, weighed, inliers)
+        places = known_viewpoints(*clouds, config.preparation.viewpoint)
+        given = None if correspondences is None else between_clouds(correspondences, prepared)
+        pair, weighed, decision = self._look(prepared, places, clock, initial, given)
+        if places is None and self._asks_flipped(decision.judgement):
+            other = self._look(prepared, None, clock, initial, given, rivals=decision)
+            if other[2].judgement.confidence > decision.judgement.confidence:
+                pair, weighed, decision = other
+        read = (source, target), pair.clouds, wanted, places is not None
+        for remark in remarks(*read, config.preparation, decision.judgement):
+            decision = decision.with_note(remark)
+        if NETWORK in self.pipeline.scorers:
+            opinion = opinion_of(decision.answer)
+            said = None if opinion is None else opinion.output
+            weighed = said or FilterOutput(np.zeros(len(pair.matched)))
+        result = finished_result(pair, decision, config, clock.stop())
+        inliers = decision.residuals(pair.matched) < pair.inlier_threshold
+        return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
     def _look(
         self,
-        described: tuple[PreparedCloud, PreparedCloud],
-        viewpoints: tuple[FloatArray, FloatArray] | None,
+        prepared: Clouds,
+        places: Places,
+        clock: StageClock,
         initial: ArrayLike | None,
-        clock: StageClock,
+        given: Correspondences | None,
         *,
-        rivals: Findings | None = None,
-    ) -> _Look:
-        """From described clouds to a judged answer; a doubtful one with hypotheses of coarser grids too.
-
-        ``rivals``: what an earlier look found. This one then turns the source's normals over, on every grid,
-        and its answer must beat what was found before, as in repeated structure.
-        """
-        config, voxel_size, as_seen = self.config, described[0].voxel_size, described
-        flipped = rivals is not None
-        if flipped:
-            described = flip_pair(as_seen, config.preparation)
-        threshold = config.estimator.inlier_threshold * voxel_size
-        matched, weighed, hypotheses = self.propose(described, clock, viewpoints)
-        with single_blas_thread():
-            chooser = Chooser(
-                described, matched, threshold, config, clock, self._ask_about(matched, voxel_size)
-            )
-            chooser.consider(hypotheses)
-            if rivals is not None:
-                chooser.consider(rivals.motions())
-            if initial is not None:
-                chooser.consider_guess(initial)
-            findings = chooser.conclude()
-            if self._is_doubtful(findings.judgement):
-                chooser.consider(self.propose_from_more(described, len(matched), clock, viewpoints))
-                for grid in config.second_look.grids:
-                    size = grid * voxel_size
-                    more = self.propose_on_grid(size, as_seen, clock, viewpoints, flipped=flipped)
-                    chooser.consider(more)
-                findings = chooser.conclude(config.second_look.num_refined, config.second_look.num_judged)
-        return _Look(described, matched, weighed, findings)
-
-    def describe(
-        self, source: PointCloud, target: PointCloud, voxel_size: float, clock: StageClock
-    ) -> tuple[PreparedCloud, PreparedCloud]:
-        """Both clouds on one voxel grid, with normals turned by one rule and features."""
-        views = find_viewpoints(source, target, self.config.preparation.viewpoint)
-        return (
-            self.describe_cloud(source, voxel_size, views[0], clock),
-            self.describe_cloud(target, voxel_size, views[1], clock),
-        )
-
-    def describe_cloud(
-        self, cloud: PointCloud, voxel_size: float, viewpoint: FloatArray | None, clock: StageClock
-    ) -> PreparedCloud:
-        """One cloud prepared and described, or as the cache holds it."""
-        config, seed = self.config.preparation, self.config.seed
-
-        def make() -> PreparedCloud:
-            clock("prepare")
-            prepared = prepare(cloud, voxel_size, config, viewpoint=viewpoint, seed=seed)
-            clock("describe")
-            return describe(prepared, config)
-
-        if self._cache is None:
-            return make()
-        return self._cache.fetch(cloud, voxel_size, viewpoint, config, seed=seed, make=make)
-
-    def propose(
-        self,
-        described: tuple[PreparedCloud, PreparedCloud],
-        clock: StageClock,
-        viewpoints: tuple[FloatArray, FloatArray] | None = None,
-        most: int | None = None,
-    ) -> tuple[Correspondences, FilterOutput, list[Hypothesis]]:
-        """Match, weigh and solve.
+        rivals: Decision | None = None,
+    ) -> tuple[Pair, FilterOutput, Decision]:
+        """From clouds with features to a decision; a doubtful one with hypotheses of coarser grids too.
 
         Args:
-            described: both clouds.
+            prepared: both clouds on one grid.
+            places: where the sensors are believed to have stood, local coordinates.
             clock: told of the stages.
-            viewpoints: where the sensors are believed to have stood, local coordinates.
-            most: matches used; None takes what the configuration says.
+            initial: a user's first guess, or None.
+            given: a user's own matches, which then take the place of ours, or None.
+            rivals: what an earlier look decided. This one then turns the source's normals over, on every grid,
+                and its answer must beat what was found before, as in repeated structure.
         """
-        config, voxel_size = self.config, described[0].voxel_size
-        clock("match")
-        matching = config.matching
-        if most is not None:
-            matching = matching.model_copy(update={"max_correspondences": most})
-        matched = match(*described, matching, seed=config.seed, with_ratio=self._wants_ratio)
-        matched = replace(matched, viewpoints=viewpoints)
-        clock("weigh")
-        if self._shows_motions:  # that comes later: those that the clouds like best
-            weighed = FilterOutput(np.ones(len(matched)))
-        else:
-            weighed = self._filter(matched, voxel_size=voxel_size, seed=config.seed)
-        clock("solve")
-        threshold = config.estimator.inlier_threshold * voxel_size
-        found = solve(
-            self._estimator, matched, weighed, config.estimator, inlier_threshold=threshold, seed=config.seed
-        )
-        return matched, weighed, found
-
-    def propose_from_more(
-        self,
-        described: tuple[PreparedCloud, PreparedCloud],
-        known: int,
-        clock: StageClock,
-        viewpoints: tuple[FloatArray, FloatArray] | None = None,
-    ) -> list[Hypothesis]:
-        """Hypotheses from more matches of the same grid than the ``known`` ones.
-
-        None where there are no more.
-        """
-        usual, most = self.config.matching.max_correspondences, self.config.second_look.max_correspondences
-        if known < usual or most <= usual:
-            return []
-        return self.propose(described, clock, viewpoints, most)[2]
-
-    def propose_on_grid(
-        self,
-        voxel_size: float,
-        described: tuple[PreparedCloud, PreparedCloud],
-        clock: StageClock,
-        viewpoints: tuple[FloatArray, FloatArray] | None = None,
-        *,
-        flipped: bool = False,
-    ) -> list[Hypothesis]:
-        """Hypotheses from the same clouds on a coarser grid of this edge, where features see more.
-
-        None where a cloud is too small for the grid. ``flipped``: with the source's normals turned over.
-        """
-        clouds = [PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in described]
-        views = [cloud.viewpoint for cloud in described]
-        try:
-            source = self.describe_cloud(clouds[0], voxel_size, views[0], clock)
-            target = self.describe_cloud(clouds[1], voxel_size, views[1], clock)
-        except EmptyCloudError:
-            return []
-        pair = flip_pair((source, target), self.config.preparation) if flipped else (source, target)
-        return self.propose(pair, clock, viewpoints)[2]
+        line, look, flipped = self.pipeline, self.config.second_look, rivals is not None
+        clouds = line.flipped(prepared, clock) if flipped else prepared
+        pair = line.match(clouds, places, clock) if given is None else line.pair(clouds, given, places)
+        weighed, proposed = line.propose(pair, clock)
+        with single_blas_thread():
+            selection = Selection(pair, line.scorers, line.refiner, self.config, clock)
+            selection.add(proposed)
+            if rivals is not None:
+                selection.add(rivals.transforms())
+            if initial is not None:
+                selection.add_guess(initial)
+            decision = selection.decide()
+            if self._is_doubtful(decision.judgement):
+                if given is None:
+                    for further in line.further_pairs(pair, prepared, places, clock, flipped):
+                        selection.add(line.propose(further, clock)[1])
+                decision = selection.decide(look.num_refined, look.num_judged)
+        return pair, weighed, decision
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""
         look = self.config.second_look
         doubtful = judgement.status != "ok" and judgement.confidence < look.below
-        wanted = len(look.grids) > 0 or look.max_correspondences > 0
-        return doubtful and self.config.verification.enabled and wanted
+        wanted = bool(look.grids) or look.max_correspondences > 0
+        return doubtful and bool(self.pipeline.scorers) and wanted
 
     def _asks_flipped(self, judgement: Judgement) -> bool:
-        """Whether, no sensor being known, the pair is asked again with the source's normals turned over.
-
-        A guessed sensor may stand on the wrong side of everything, as behind a wall, and then no feature of
-        one scan is like any of the other.
-        """
-        return judgement.status != "ok" and self.config.second_look.flip and self.config.verification.enabled
-
-    @property
-    def _shows_motions(self) -> bool:
-        """Whether a network is shown motions after they are proposed and verified, not before as a filter.
-
-        Least squares needs its weights, and without verification nothing says which motions to show.
-        """
-        return (
-            self._judge is not None
-            and self.config.verification.enabled
-            and self.config.estimator.name != "svd"
-        )
-
-    def _ask_about(
-        self, matched: Correspondences, voxel_size: float
-    ) -> Callable[[FloatArray], list[Judged]] | None:
-        """The network's opinion of motions of these correspondences, or None without a network for that."""
-        judge = self._judge
-        if judge is None or not self._shows_motions:
-            return None
-        of_pair: list[PairJudge] = []
-
-        def ask(motions: FloatArray) -> list[Judged]:
-            if not of_pair:  # not before it is needed, and then once
-                of_pair.append(judge(matched, voxel_size=voxel_size))
-            return of_pair[0](motions)
-
-        return ask
+        """Whether, no sensor being known, the pair is asked again with the source's normals turned over: a guessed
+        sensor may stand on the wrong side of everything, and then no feature of one scan is like the other's."""
+        return judgement.status != "ok" and self.config.second_look.flip and bool(self.pipeline.scorers)
 
 
 def register(
@@ -388,17 +214,19 @@ def register(
     *,
     config: RegistrationConfig | None = None,
     initial: ArrayLike | None = None,
+    correspondences: ArrayLike | None = None,
     progress: Progress | None = None,
     **overrides: Any,
 ) -> RegistrationResult:
-    """The rigid motion p_target = R p_source + t that lays source on target; no first guess is needed.
+    """The rigid transform p_target = R p_source + t that maps source into target; no first guess is needed.
 
     Args:
         source: path, (N, 3) array or tensor, Open3D or trimesh cloud or mesh, or `PointCloud`.
         target: likewise, in the same unit of length.
         config: complete configuration; None takes the defaults.
-        initial: (4, 4) a first guess in the files' coordinates, or None; it is verified against the clouds
-            beside the hypotheses found, not trusted.
+        initial: (4, 4) a first guess in the files' coordinates, or None; scored like all others, not trusted.
+        correspondences: (N, 6) matches of your own, rows [source xyz, target xyz] in the files' coordinates,
+            which take the place of ours, or None; the clouds score, refine and decide.
         progress: called with the name of each stage as it begins.
         overrides: top-level configuration keys such as ``voxel_size=0.05`` or ``seed=1``.
 
@@ -406,13 +234,15 @@ def register(
         The answer with status, confidence and reasons; look at ``result.ok`` before using the transform.
 
     Raises:
-        InputError: a cloud that cannot be read or has too few usable points, or a guess that is no motion.
-        ConfigError: an unknown or invalid override, or a guess where verification is switched off.
+        InputError: a cloud that cannot be read or has too few usable points, a guess that is no rigid
+            transform, or correspondences that are no (N, 6) finite numbers.
+        ConfigError: an unknown or invalid override, or a guess where nothing scores.
     """
     if overrides:
         tree = (config or RegistrationConfig()).model_dump()
         config = build_config(RegistrationConfig, {**tree, **overrides}, "register(...)")
-    return Registrar(config).register(source, target, initial=initial, progress=progress)
+    given: dict[str, Any] = {"initial": initial, "correspondences": correspondences, "progress": progress}
+    return Registrar(config).register(source, target, **given)
 
 
 def _load(data: Any, role: str, seed: int) -> PointCloud:

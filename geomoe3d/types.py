@@ -8,6 +8,7 @@ the cloud's float64 ``origin``. Everything between loading and the result works 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,7 @@ class PreparedCloud:
     Attributes:
         points: (n, 3) one representative per occupied voxel, local coordinates.
         normals: (n, 3) unit normals turned towards ``viewpoint``, else to the centroid.
-        features: (n, 33) float32 L2-normalised FPFH, or None before description.
+        features: (n, D) float32 of length 1, of a descriptor, or None before it was asked.
         voxel_size: edge of the grid in cloud units.
         viewpoint: (3,) local position of the sensor, known or guessed, or None.
         origin: (3,) float64 shift as in `PointCloud`.
@@ -122,6 +123,19 @@ class Correspondences:
         """(N, 3) target points."""
         return self.points[:, 3:]
 
+    @classmethod
+    def between(
+        cls, source: PreparedCloud, target: PreparedCloud, rows: IntArray, columns: IntArray
+    ) -> Correspondences:
+        """Source points ``rows`` (N,) matched with target points ``columns`` (N,), with their normals."""
+        return cls(
+            np.hstack([source.points[rows], target.points[columns]]),
+            rows,
+            columns,
+            normals=(source.normals[rows], target.normals[columns]),
+            normals_signed=source.viewpoint is not None and target.viewpoint is not None,
+        )
+
     def take(self, rows: IntArray | BoolArray) -> Correspondences:
         """The correspondences of the given rows (index or mask), all per-row attributes kept."""
 
@@ -141,21 +155,45 @@ class Correspondences:
         )
 
 
-@dataclass(frozen=True)
+class Score(Protocol):
+    """What one scorer says of one hypothesis."""
+
+    @property
+    def factor(self) -> float:
+        """Not negative; the score of a hypothesis is the product of what its scorers say."""
+        ...
+
+
+@dataclass(eq=False)
 class Hypothesis:
-    """One candidate rigid motion with what the correspondences say for it.
+    """One candidate transform and all that becomes known of it, from the proposal to the answer.
 
     Attributes:
         T_target_source: (4, 4), p_target = R p_source + t in local coordinates.
-        score: larger is better; comparable only between hypotheses of one estimator call.
+        proposal_score: the estimator's own; larger is better, comparable only within one call of it.
         num_inliers: correspondences with a residual under the inlier threshold.
-        verdict: logit that the motion is right, where a network has judged it, else None.
+        scores: what each scorer says of it, by the scorer's name; of one that is asked about the best alone,
+            what is assumed of the others.
+        asked: names of the scorers that were really asked about it.
+        refined: the same hypothesis after refinement, once it was refined; itself an hypothesis.
+        note: what went wrong in the refinement that led to it, or None.
     """
 
     T_target_source: FloatArray
-    score: float
-    num_inliers: int
-    verdict: float | None = None
+    proposal_score: float = 0.0
+    num_inliers: int = 0
+    scores: dict[str, Score] = field(default_factory=dict)
+    asked: set[str] = field(default_factory=set)
+    refined: Hypothesis | None = None
+    note: str | None = None
+
+    @property
+    def score(self) -> float:
+        """Product of the factors of all scorers; 1 where none was asked."""
+        product = 1.0
+        for said in self.scores.values():
+            product *= said.factor
+        return product
 
 
 @dataclass(frozen=True)
@@ -167,12 +205,9 @@ class FilterOutput:
         logits: (N,) raw scores, larger is likelier an inlier, or None.
         groups: (N,) small integers, which part of the filter handled each correspondence, or None.
         group_names: a name for each group, for display.
-        hypotheses: motions that the filter judged, best first; the weights hold under the first, and the
-            estimator need not seek them again. Empty for filters that know none.
     """
 
     weights: FloatArray
     logits: FloatArray | None = None
     groups: IntArray | None = None
     group_names: tuple[str, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] = ()

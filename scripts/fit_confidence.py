@@ -1,6 +1,6 @@
 """Fits the confidence: P(the answer is right) as a logistic function of what the clouds say of it.
 
-    python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 250] [--set filter.name=none]
+    python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 250] [--set scoring.scorers=[surfaces]]
         [--set preparation.viewpoint=centroid] [--out runs/confidence.jsonl]
 
 FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
@@ -36,7 +36,7 @@ BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 UNRELATED_WEIGHT = 0.25
 LOOKS = (
     ["second_look.grids=[]", "second_look.max_correspondences=0"],
-    ["second_look.below=1.0", "judgement.min_confidence=1.0"],
+    ["second_look.below=1.0", "decision.min_confidence=1.0"],
 )
 """Settings by which a pair gets one look, and always two."""
 

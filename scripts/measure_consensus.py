@@ -55,7 +55,7 @@ def main() -> None:
                 if isinstance(estimate, ConsensusEstimator) and not given.lengths_alone:
                     rows = Correspondences(pair.points, viewpoints=AT_ZERO)
                     near = Surroundings.of(rows, INLIER_THRESHOLD)
-                    found = estimate.with_surroundings(near)(pair.points, inlier_threshold=INLIER_THRESHOLD)
+                    found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, surroundings=near)
                 else:
                     found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD)
                 seconds[name].append(time.perf_counter() - begin)

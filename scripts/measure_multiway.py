@@ -111,7 +111,7 @@ def truth_drift(files: list[Path], scene: str, config: RegistrationConfig) -> Fl
         cloud = load_points(scan.path)
         view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
         key = number(scan.name)
-        surfaces[key] = Surface.of(registrar.describe_cloud(cloud, size, view, StageClock()))
+        surfaces[key] = Surface.of(registrar.pipeline.prepare(cloud, size, view, StageClock()))
         origins[key] = cloud.origin
         poses[key] = shift_frames(truth[key], -cloud.origin, np.zeros(3))
     overlaps = Overlaps({key: surface.points for key, surface in surfaces.items()})

@@ -41,7 +41,9 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import load_config
+from geomoe3d.correspondence_registration import CorrespondenceRegistrar
 from geomoe3d.data.collection import load_fragment, open_collection
 from geomoe3d.data.describe import describe_fragment
 from geomoe3d.data.draw import draw_pair
@@ -59,13 +61,11 @@ from geomoe3d.data.threedmatch import (
     iterate_fixed_correspondences,
     load_benchmark,
 )
-from geomoe3d.estimators.base import make_estimator
-from geomoe3d.estimators.proposals import solve
 from geomoe3d.evaluation.metrics import motion_errors
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
-from geomoe3d.filters.base import make_filter
 from geomoe3d.geometry.se3 import inverse, residuals
 from geomoe3d.registration import Registrar
+from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Correspondences, FloatArray
 
 AT_ZERO = (np.zeros(3), np.zeros(3))
@@ -117,8 +117,8 @@ def main() -> None:
     if unknown:
         parser.error(f"unknown part {', '.join(sorted(unknown))}; known: {', '.join(PARTS)}")
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    weights = [] if given.weights is None else [f"filter.weights={given.weights}"]
-    ways = {"without": ["filter.name=none"], "network": ["filter.name=geomoe", *weights]}
+    weights = [] if given.weights is None else [f"scoring.weights={given.weights}"]
+    ways = {"without": ["scoring.scorers=[surfaces]"], "network": weights}
     print(
         "| case | pairs | size | right: without / network | only without / only network | ok | right of ok "
         "| median ms: without / network |"
@@ -164,7 +164,7 @@ def ask(case: Case, settings: tuple[str, ...]) -> dict[str, Any]:
     if of_clouds:  # weights are read before the clock starts
         register = registrar((*settings, *case.settings)).register
     else:
-        parts_of(settings)
+        without_clouds(settings)
     begin = time.perf_counter()
     if of_clouds:
         result = register(*case.given)
@@ -190,21 +190,15 @@ def registrar(settings: tuple[str, ...]) -> Registrar:
 
 
 @lru_cache(maxsize=4)
-def parts_of(settings: tuple[str, ...]) -> tuple[Any, Any, Any]:
-    """Filter, estimator and configuration."""
-    config = load_config(None, list(settings))
-    return (
-        make_filter(config.filter.name, config.filter.weights, config.estimator),
-        make_estimator(config.estimator),
-        config,
-    )
+def without_clouds(settings: tuple[str, ...]) -> CorrespondenceRegistrar:
+    """Kept warm."""
+    return CorrespondenceRegistrar(load_config(None, list(settings)))
 
 
 def from_correspondences(matched: Correspondences, settings: tuple[str, ...]) -> FloatArray | None:
-    """Filter and consensus."""
-    weigh, estimate, config = parts_of(settings)
-    weighed = weigh(matched, voxel_size=VOXEL_SIZE, seed=0)
-    found = solve(estimate, matched, weighed, config.estimator, inlier_threshold=INLIER_THRESHOLD, seed=0)
+    """Outlier rejection, proposing and what the network says."""
+    pair = Pair(matched, VOXEL_SIZE, INLIER_THRESHOLD)
+    found, _ = without_clouds(settings).hypotheses(pair, StageClock())
     return found[0].T_target_source if found else None
 
 

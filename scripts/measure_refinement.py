@@ -19,7 +19,7 @@ from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import PreparationConfig, RefinementConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, shift_frames, transform_points
-from geomoe3d.refinement.icp import refine
+from geomoe3d.refinement.icp import CloudAligner
 
 VOXEL_SIZE = 0.05
 
@@ -41,9 +41,9 @@ def main() -> None:
         ]
         for method in ("icp", "gicp"):
             for reach in (2.0, 1.5, 1.0):
-                config = RefinementConfig.model_validate({"method": method, "max_distance": reach})
+                config = RefinementConfig.model_validate({"name": method, "max_distance": reach})
                 begin = time.perf_counter()
-                T, _ = refine(truth @ disturbance, clouds[0], clouds[1], config)
+                T, _ = CloudAligner(clouds[0], clouds[1], config)(truth @ disturbance)
                 seconds = time.perf_counter() - begin
                 apart = transform_points(T, source.points) - transform_points(truth, source.points)
                 print(

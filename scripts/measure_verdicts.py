@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from geomoe3d.filters.motion_judge import MotionJudge
 from numpy.typing import NDArray
 
 from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
@@ -22,7 +23,6 @@ from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.evaluation.calibration import auroc_of
 from geomoe3d.evaluation.metrics import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
-from geomoe3d.filters.motion_judge import MotionJudge
 from geomoe3d.geometry.se3 import residuals
 from geomoe3d.types import BoolArray, Correspondences, FloatArray
 
@@ -44,7 +44,7 @@ def main() -> None:
         for pair in list(iterate_fixed_correspondences(None, benchmark))[:: given.every]:
             given_rows = Correspondences(pair.points, viewpoints=AT_ZERO)
             near = Surroundings.of(given_rows, INLIER_THRESHOLD)
-            found = estimate.with_surroundings(near)(pair.points, inlier_threshold=INLIER_THRESHOLD)
+            found = estimate(pair.points, inlier_threshold=INLIER_THRESHOLD, surroundings=near)
             if not found:
                 continue
             motions = np.array([h.T_target_source for h in found])

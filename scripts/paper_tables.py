@@ -29,16 +29,16 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.config import build_config, load_config
-from geomoe3d.correspondence_registration import CorrespondenceSolver
+from geomoe3d.config import FilterConfig, build_config, load_config
+from geomoe3d.correspondence_registration import CorrespondenceRegistrar
 from geomoe3d.data.threedmatch import BENCHMARKS, FixedCorrespondences, iterate_fixed_correspondences
 from geomoe3d.evaluation.compare import mcnemar_p
 from geomoe3d.evaluation.intervals import Quantity, measure_all
 from geomoe3d.evaluation.metrics import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
-from geomoe3d.filters.base import Filter, make_filter
-from geomoe3d.filters.correspondence_network import NetworkFilter
-from geomoe3d.filters.network import GeoMoEFilter
+from geomoe3d.filters.base import OutlierFilter, outlier_filter
+from geomoe3d.filters.geomoe import GeoMoEFilter
+from geomoe3d.filters.network import NetworkFilter
 from geomoe3d.geometry.se3 import make_transform, residuals, rotation_error_deg
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.build import Network, build_network
@@ -69,15 +69,15 @@ class Row:
     f1: float
 
 
-class Remembering:
+class Remembering(OutlierFilter):
     """A filter that answers the same question once: both estimators ask it."""
 
-    def __init__(self, inner: Filter) -> None:
+    def __init__(self, inner: OutlierFilter) -> None:
         self.inner = inner
         self._last: tuple[bytes, FilterOutput] | None = None
 
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
-        """See `Filter`."""
+        """See `OutlierFilter`."""
         asked = correspondences.points.tobytes()
         if self._last is None or self._last[0] != asked:
             self._last = asked, self.inner(correspondences, voxel_size=voxel_size, seed=seed)
@@ -131,10 +131,10 @@ def write(path: Path, lines: Iterable[str]) -> None:
     print(text)
 
 
-def open_filter(weights: str, frame: str | None) -> Filter:
+def open_filter(weights: str, frame: str | None) -> OutlierFilter:
     """The filter of trained weights, or of a name that needs none."""
     if weights in ("none", "spectral"):
-        return make_filter(weights)
+        return outlier_filter.make(FilterConfig(name=weights))
     model, _ = load_network(weights)
     if frame is not None:
         model.config = model.config.model_copy(update={"frame": frame})
@@ -147,8 +147,8 @@ def measured(
     """Every method on every n-th pair, as published and turned."""
     solvers = {}
     for name in estimators:
-        solvers[name] = CorrespondenceSolver(
-            load_config(None, ["filter.name=none", f"estimator.name={name}"])
+        solvers[name] = CorrespondenceRegistrar(
+            load_config(None, ["scoring.scorers=[surfaces]", f"estimator.name={name}"])
         )
     for index, pair in enumerate(iterate_fixed_correspondences(None, benchmark)):
         if index % every:
@@ -159,7 +159,7 @@ def measured(
             true = residuals(T, points[:, :3], points[:, 3:]) < INLIER_THRESHOLD
             for method, weigh in filters.items():
                 for name, solver in solvers.items():
-                    solver.filter = weigh
+                    solver.pipeline.filter = weigh
                     found = solver(points, voxel_size=VOXEL_SIZE, inlier_threshold=INLIER_THRESHOLD, seed=0)
                     logits = found.weighed.logits
                     kept = found.weighed.weights > 0 if logits is None else logits > 0

@@ -60,10 +60,10 @@ class FakeRegistrar:
     def __init__(self, config=None):
         self.config = config
 
-    def register(self, source, target, *, initial=None, progress=None):
+    def register(self, source, target, *, initial=None, correspondences=None, progress=None):
         type(self).asked.append((source, target, self.config))
         type(self).initial = initial
-        for stage in ("load", "judge"):
+        for stage in ("load", "decide"):
             progress(stage)
         if self.noise:
             print(self.noise)
@@ -72,7 +72,7 @@ class FakeRegistrar:
             raise self.answer
         return self.answer
 
-    def explain(self, source, target, *, initial=None, progress=None):
+    def explain(self, source, target, *, initial=None, correspondences=None, progress=None):
         result = self.register(source, target, initial=initial, progress=progress)
         points = np.random.default_rng(0).normal(size=(50, 3))
         moved = transform_points(TRUTH, points)

@@ -76,7 +76,7 @@ def posed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def own_cache(tmp_path_factory):
-    """A cache of described clouds of the test file's own."""
+    """A cache of features of the test file's own."""
     kept = os.environ.get("GEOMOE3D_CACHE")
     os.environ["GEOMOE3D_CACHE"] = str(tmp_path_factory.mktemp("cache"))
     yield

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError, InputError
-from geomoe3d.filters.motion_judge import MotionJudge
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.networks.aligned import CHANNELS
 from geomoe3d.networks.architecture import CHANNEL_WIDTHS, NetworkConfig
 from geomoe3d.networks.geomoe import PRIOR_KERNEL
 from geomoe3d.networks.inputs import pair_input
+from geomoe3d.networks.motion_judge import MotionJudge
 from geomoe3d.types import Correspondences
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -1,4 +1,4 @@
-"""Findings: none where no motion was found, and residuals after the one that was."""
+"""Decisions: none where no transform was found, and residuals after the one that was."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 from surface_pairs import motion
 
-from geomoe3d.decision.answer import Findings
+from geomoe3d.decision.answer import Decision
 from geomoe3d.geometry.se3 import inverse, transform_points
-from geomoe3d.scoring.surfaces import Evidence
-from geomoe3d.types import Correspondences
+from geomoe3d.types import Correspondences, Hypothesis
 
 
 def test_nothing_found_holds_no_transform() -> None:
-    nothing = Findings.nothing("no motion")
+    nothing = Decision.failed("no motion")
     assert np.isnan(nothing.T_target_source).all()
     assert nothing.judgement.status == "failed"
     assert nothing.judgement.confidence == 0
@@ -28,8 +27,8 @@ def test_residuals_are_distances_after_the_motion() -> None:
     T, rng = motion(5), np.random.default_rng(5)
     source, gaps = rng.normal(size=(6, 3)), rng.normal(size=(6, 3))
     rows = Correspondences(np.hstack([source, transform_points(T, source) + gaps]))
-    found = replace(Findings.nothing(""), T_target_source=T, evidence=Evidence(0.6, 0.6, 1.0, 0.0))
+    found = replace(Decision.failed(""), answer=Hypothesis(T))
     np.testing.assert_allclose(found.residuals(rows), np.linalg.norm(gaps, axis=1))
     exchanged = Correspondences(rows.points[:, [3, 4, 5, 0, 1, 2]])
-    back = replace(found, T_target_source=inverse(T))
+    back = replace(found, answer=Hypothesis(inverse(T)))
     np.testing.assert_allclose(back.residuals(exchanged), np.linalg.norm(gaps, axis=1))

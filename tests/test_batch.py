@@ -241,7 +241,7 @@ def copied(finished, tmp_path):
         ({"cache": __file__}, OutputError, "is a file; the cache of features is a folder"),
         ({"cache": f"{__file__}/deeper"}, OutputError, "is a file"),
         ({"config": ["filter.name=nothing"]}, ConfigError, "unknown filter"),
-        ({"config": ["filter.name=geomoe", "filter.weights=nowhere"]}, CheckpointError, "nowhere"),
+        ({"config": ["scoring.weights=nowhere"]}, CheckpointError, "nowhere"),
     ],
 )
 def test_what_is_refused_is_before_anything_is_removed_or_written(

@@ -9,36 +9,50 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
-from geomoe3d.decision.selection import Chooser
+from geomoe3d.decision.selection import Selection, distinct
 from geomoe3d.errors import ConfigError, EmptyCloudError
-from geomoe3d.features.fpfh import describe
-from geomoe3d.filters.base import FilterOutput
-from geomoe3d.filters.motion_judge import Judged
+from geomoe3d.features.base import with_features
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg
 from geomoe3d.matching.nearest import match
+from geomoe3d.networks.motion_judge import Judged
+from geomoe3d.pipeline import Pipeline
+from geomoe3d.refinement.base import refiner
 from geomoe3d.registration import Registrar
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.scoring.surfaces import Evidence, distinct
-from geomoe3d.types import Hypothesis
+from geomoe3d.scoring.base import Scorer
+from geomoe3d.scoring.network import NetworkScorer, Opinion, opinion_of
+from geomoe3d.scoring.surfaces import SurfaceScorer
+from geomoe3d.types import FilterOutput, Hypothesis
 
 VOXEL = 0.05
+FPFH = FpfhDescriptor()
 
 
 @pytest.fixture(scope="module")
 def pair():
     config = RegistrationConfig().preparation
     source, target, T = make_sample_pair(seed=0)
-    clouds = tuple(describe(prepare(c, VOXEL, config, viewpoint=-c.origin), config) for c in (source, target))
+    clouds = tuple(
+        with_features(prepare(c, VOXEL, config, viewpoint=-c.origin), FPFH) for c in (source, target)
+    )
     return clouds, T
 
 
-def chooser(pair, *assignments: str) -> Chooser:
+def selection(pair, *assignments: str, network: Scorer | None = None) -> Selection:
     config = load_config(None, list(assignments))
-    return Chooser(pair[0], match(*pair[0], config.matching), 2 * VOXEL, config, StageClock())
+    seen = Pair(match(*pair[0], config.matching), VOXEL, 2 * VOXEL, 0, *pair[0])
+    scorers: dict[str, Scorer] = {"surfaces": SurfaceScorer()}
+    if network is not None:
+        scorers["network"] = network
+    if config.scoring.scorers == ():
+        scorers = {}
+    return Selection(seen, scorers, refiner.make(config.refinement), config, StageClock())
 
 
 def off(T, degrees: float, shift: float) -> Hypothesis:
@@ -49,64 +63,76 @@ def off(T, degrees: float, shift: float) -> Hypothesis:
 def test_the_clouds_choose_whatever_the_order_of_the_lots(pair):
     right, wrong = off(pair[1], 0.5, 0.01), off(pair[1], 90, 1.0)
     for lots in ([[wrong], [right]], [[right], [wrong]], [[wrong, right]]):
-        asked = chooser(pair)
+        asked = selection(pair)
         for lot in lots:
-            asked.consider(lot)
-        findings = asked.conclude()
+            asked.add(lot)
+        findings = asked.decide()
         assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
         assert findings.judgement.status == "ok"
 
 
 def test_refining_several_before_the_choice_saves_one_that_lay_off(pair):
     """Three hypotheses, the right one too far off to look best; refined, it is."""
-    asked = chooser(pair)
-    asked.consider([off(pair[1], 90, 0.3), off(pair[1], 180, 0.2), off(pair[1], 4, 0.06)])
-    assert rotation_error_deg(asked.conclude(3).T_target_source, pair[1]) < 1
+    asked = selection(pair)
+    asked.add([off(pair[1], 90, 0.3), off(pair[1], 180, 0.2), off(pair[1], 4, 0.06)])
+    assert rotation_error_deg(asked.decide(3).T_target_source, pair[1]) < 1
 
 
 def test_without_verification_the_first_of_the_first_lot_is_the_answer(pair):
-    asked = chooser(pair, "verification.enabled=false", "refinement.method=none")
-    asked.consider([off(pair[1], 90, 1.0), off(pair[1], 0, 0.0)])
-    asked.consider([off(pair[1], 0, 0.0)])
-    assert rotation_error_deg(asked.conclude().T_target_source, pair[1]) == pytest.approx(90)
+    asked = selection(pair, "scoring.scorers=[]", "refinement.name=none")
+    asked.add([off(pair[1], 90, 1.0), off(pair[1], 0, 0.0)])
+    asked.add([off(pair[1], 0, 0.0)])
+    assert rotation_error_deg(asked.decide().T_target_source, pair[1]) == pytest.approx(90)
+
+
+class Believer(NetworkScorer):
+    """A network that believes in transforms close to the given ones and in no other."""
+
+    def __init__(self, liked, shown) -> None:
+        self._liked, self._shown = liked, shown
+
+    def about(self, pair):
+        def say(transforms):
+            self._shown.extend(transforms)
+            return [
+                Opinion(verdict, Judged(verdict, partial(FilterOutput, np.full(3, k + 1.0))))
+                for k, verdict in enumerate(map(self._verdict, transforms))
+            ]
+
+        return say
+
+    def _verdict(self, T) -> float:
+        return 6.0 if any(np.abs(T - x).max() < 0.1 for x in self._liked) else -6.0
 
 
 def opinions(*liked: np.ndarray):
-    """A network that believes in motions close to the given ones and in no other; and what it was shown."""
-    shown = []
-
-    def network(motions):
-        shown.extend(motions)
-        return [
-            Judged(
-                6.0 if any(np.abs(m - x).max() < 0.1 for x in liked) else -6.0,
-                partial(FilterOutput, np.full(3, k + 1.0)),
-            )
-            for k, m in enumerate(motions)
-        ]
-
-    return network, shown
+    """Such a network, and what it was shown."""
+    shown: list[np.ndarray] = []
+    return Believer(liked, shown), shown
 
 
-def with_network(pair, network, *assignments: str) -> Chooser:
-    config = load_config(None, list(assignments))
-    return Chooser(pair[0], match(*pair[0], config.matching), 2 * VOXEL, config, StageClock(), network)
+def with_network(pair, network, *assignments: str) -> Selection:
+    return selection(pair, *assignments, network=network)
+
+
+def verdict_of(decision) -> float | None:
+    opinion = opinion_of(decision.answer)
+    return None if opinion is None else opinion.verdict
 
 
 def test_a_network_turns_the_choice_where_the_clouds_waver(pair):
     right, near = off(pair[1], 0.5, 0.01), off(pair[1], 20, 0.0)
-    plain = chooser(pair, "refinement.method=none")
-    plain.consider([right, near])
-    assert rotation_error_deg(plain.conclude().T_target_source, pair[1]) < 1
+    plain = selection(pair, "refinement.name=none")
+    plain.add([right, near])
+    assert rotation_error_deg(plain.decide().T_target_source, pair[1]) < 1
     network, shown = opinions(near.T_target_source)
-    asked = with_network(pair, network, "refinement.method=none")
-    asked.consider([right, near])
-    findings = asked.conclude()
+    asked = with_network(pair, network, "refinement.name=none")
+    asked.add([right, near])
+    findings = asked.decide()
     assert len(shown) == 2
     assert rotation_error_deg(findings.T_target_source, pair[1]) == pytest.approx(20, abs=0.1)
-    assert findings.evidence.verdict == 6.0
-    assert findings.weighed is not None
-    np.testing.assert_array_equal(findings.weighed.weights, [2.0, 2.0, 2.0])
+    assert verdict_of(findings) == 6.0
+    np.testing.assert_array_equal(opinion_of(findings.answer).output.weights, [2.0, 2.0, 2.0])
 
 
 def test_a_network_is_shown_a_few_distinct_motions_once(pair):
@@ -114,11 +140,11 @@ def test_a_network_is_shown_a_few_distinct_motions_once(pair):
     network, shown = opinions(motions[0].T_target_source)
     given = {h.T_target_source.tobytes() for h in motions}
     asked = with_network(pair, network)
-    asked.consider(motions)
-    asked.conclude(1, 2)
+    asked.add(motions)
+    asked.decide(1, 2)
     assert len(shown) == 3  # two hypotheses, and the better one again once it is refined
     assert sum(m.tobytes() in given for m in shown) == 2
-    findings = asked.conclude(3, 4)
+    findings = asked.decide(3, 4)
     assert sum(m.tobytes() in given for m in shown) == 4
     assert len({m.tobytes() for m in shown}) == len(shown)
     assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
@@ -128,35 +154,34 @@ def test_the_verdict_is_on_the_refined_motion(pair):
     """A start 8 degrees off, which the network doubts; refined it is as good as the truth, which it likes."""
     network, _ = opinions(pair[1])
     asked = with_network(pair, network)
-    asked.consider([off(pair[1], 8, 0.05)])
-    findings = asked.conclude()
-    assert findings.evidence.verdict == 6.0
+    asked.add([off(pair[1], 8, 0.05)])
+    findings = asked.decide()
+    assert verdict_of(findings) == 6.0
     assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
-    plain = with_network(pair, network, "refinement.method=none")
-    plain.consider([off(pair[1], 8, 0.05)])
-    assert plain.conclude().evidence.verdict == -6.0
+    plain = with_network(pair, network, "refinement.name=none")
+    plain.add([off(pair[1], 8, 0.05)])
+    assert verdict_of(plain.decide()) == -6.0
 
 
 def test_without_verification_no_network_is_asked(pair):
     network, shown = opinions()
-    asked = with_network(pair, network, "verification.enabled=false")
-    asked.consider([off(pair[1], 0, 0.0)])
-    assert asked.conclude().evidence.verdict is None
+    asked = with_network(pair, network, "scoring.scorers=[]")
+    asked.add([off(pair[1], 0, 0.0)])
+    assert verdict_of(asked.decide()) is None
     assert not shown
 
 
 def test_nothing_considered_is_a_failure_and_not_identity(pair):
-    findings = chooser(pair).conclude(3)
+    findings = selection(pair).decide(3)
     assert findings.judgement.status == "failed"
     assert np.isnan(findings.T_target_source).all()
 
 
 def test_distinct_motions_are_told_apart(pair):
-    evidence = Evidence(0.5, 0.5, 0.5, 0.0)
     motions = [off(pair[1], 0, 0), off(pair[1], 5, 0.05), off(pair[1], 40, 0), off(pair[1], 42, 0)]
-    found = distinct([(h, evidence) for h in motions], pair[0][0], 6 * VOXEL, 3)
+    found = distinct(motions, pair[0][0], 6 * VOXEL, 3)
     assert [id(h) for h in found] == [id(motions[0]), id(motions[2])]
-    assert len(distinct([(h, evidence) for h in motions], pair[0][0], 6 * VOXEL, 1)) == 1
+    assert len(distinct(motions, pair[0][0], 6 * VOXEL, 1)) == 1
 
 
 @pytest.fixture
@@ -166,17 +191,17 @@ def grids_seen(monkeypatch):
     Where more matches of a grid were asked for than usual, its edge is followed by their number.
     """
     seen: list[float] = []
-    propose = Registrar.propose
+    match_clouds = Pipeline.match
 
-    def spy(self, described, clock, viewpoints=None, most=None):
-        found = propose(self, described, clock, viewpoints, most)
-        seen.append(round(described[0].voxel_size / VOXEL, 6))
-        if most is not None:
-            seen.append(len(found[0]))
-        np.testing.assert_array_equal(viewpoints, np.zeros((2, 3)))
+    def spy(self, clouds, places, clock, limit=None):
+        found = match_clouds(self, clouds, places, clock, limit)
+        seen.append(round(clouds[0].voxel_size / VOXEL, 6))
+        if limit is not None:
+            seen.append(len(found.matched))
+        np.testing.assert_array_equal(places, np.zeros((2, 3)))
         return found
 
-    monkeypatch.setattr(Registrar, "propose", spy)
+    monkeypatch.setattr(Pipeline, "match", spy)
     return seen
 
 
@@ -186,12 +211,12 @@ def test_a_sure_answer_takes_no_second_look(grids_seen):
     assert grids_seen == [1]
 
 
-UNSURE = ["judgement.min_confidence=1.0", "second_look.below=1.0"]
+UNSURE = ["decision.min_confidence=1.0", "second_look.below=1.0"]
 
 
 def test_an_answer_not_ok_but_likely_takes_no_second_look(grids_seen):
     source, target, _ = make_sample_pair(seed=0)
-    registrar = Registrar(load_config(None, [f"voxel_size={VOXEL}", "judgement.min_confidence=1.0"]))
+    registrar = Registrar(load_config(None, [f"voxel_size={VOXEL}", "decision.min_confidence=1.0"]))
     answer = registrar.register(source, target)
     assert answer.status == "low_confidence"
     assert 0.8 < answer.confidence < 1
@@ -221,14 +246,14 @@ def test_an_unsure_answer_takes_one_at_more_matches_and_on_every_coarser_grid(gr
 
 
 def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatch):
-    describe_cloud = Registrar.describe_cloud
+    prepare_cloud = Pipeline.prepare
 
     def small(self, cloud, voxel_size, viewpoint, clock):
         if voxel_size > VOXEL:
             raise EmptyCloudError("2 points remain")
-        return describe_cloud(self, cloud, voxel_size, viewpoint, clock)
+        return prepare_cloud(self, cloud, voxel_size, viewpoint, clock)
 
-    monkeypatch.setattr(Registrar, "describe_cloud", small)
+    monkeypatch.setattr(Pipeline, "prepare", small)
     source, target, _ = make_sample_pair(seed=0)
     settings = [f"voxel_size={VOXEL}", *UNSURE, "second_look.max_correspondences=0"]
     assert Registrar(load_config(None, settings)).register(source, target).status != "failed"

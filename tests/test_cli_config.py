@@ -9,7 +9,7 @@ from geomoe3d.config import RegistrationConfig
 
 def test_options_reach_the_registrar_and_win_over_set_and_file(tmp_path, scan_files, fake_registrar):
     path = tmp_path / "my.yaml"
-    path.write_text("seed: 1\nvoxel_size: 0.5\nmatching: {method: mutual}\n")
+    path.write_text("seed: 1\nvoxel_size: 0.5\nmatching: {name: mutual}\n")
     code = call(
         *(
             "register",
@@ -26,7 +26,7 @@ def test_options_reach_the_registrar_and_win_over_set_and_file(tmp_path, scan_fi
     assert code == 0
     ((source, target, config),) = fake_registrar.asked
     assert [source, target] == scan_files
-    assert (config.seed, config.voxel_size, config.matching.method) == (3, 0.5, "mutual")
+    assert (config.seed, config.voxel_size, config.matching.name) == (3, 0.5, "mutual")
     assert (config.filter.name, config.estimator.name) == ("spectral", "ransac")
     assert config.estimator.inlier_threshold == 3
 

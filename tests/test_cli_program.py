@@ -142,4 +142,4 @@ def test_progress_is_shown_on_a_terminal_and_never_in_stdout(pair):
     os.close(controller)
     os.close(terminal)
     assert seen[True] == ""
-    assert "match" in seen[False] and "describe" in seen[False]
+    assert "match" in seen[False] and "features" in seen[False]

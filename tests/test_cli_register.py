@@ -255,5 +255,7 @@ def test_a_first_guess_that_is_not_there_is_named(tmp_path, scan_files, fake_reg
 
 
 def test_weights_for_a_filter_that_takes_none_are_refused(scan_files, fake_registrar, capsys):
-    assert call("register", *scan_files, "--filter", "none", "--weights", "a.safetensors") == 2
-    assert "weights 'a.safetensors' are given, but the filter 'none' takes none" in capsys.readouterr().err
+    assert call("register", *scan_files, "--filter", "spectral", "--weights", "a.safetensors") == 2
+    assert (
+        "weights 'a.safetensors' are given, but the filter 'spectral' takes none" in capsys.readouterr().err
+    )

@@ -76,7 +76,7 @@ def test_consensus_hypotheses_are_distinct_sorted_and_counted_right() -> None:
         found = ConsensusEstimator(num_hypotheses=limit)(rows, inlier_threshold=THRESHOLD)
         assert len(found) == limit or limit > 6
         assert len(found) >= min(limit, 6)
-        scores = [h.score for h in found]
+        scores = [h.proposal_score for h in found]
         assert scores == sorted(scores, reverse=True)
         for i, h in enumerate(found):
             T = h.T_target_source

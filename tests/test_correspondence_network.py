@@ -10,8 +10,8 @@ import torch
 from tiny_networks import SMALL, settle, small, tiny
 
 from geomoe3d.errors import CheckpointError
-from geomoe3d.filters.correspondence_network import NetworkFilter, network_filter
-from geomoe3d.filters.network import GeoMoEFilter
+from geomoe3d.filters.geomoe import GeoMoEFilter
+from geomoe3d.filters.network import NetworkFilter
 from geomoe3d.networks.pretrained import WeightCard, load_pretrained, save_pretrained
 from geomoe3d.training.synthetic import SyntheticConfig, SyntheticPairs
 from geomoe3d.types import Correspondences
@@ -54,14 +54,16 @@ def test_plain_and_fast_way_of_geomoe_agree() -> None:
 
 def test_weights_are_asked_for_and_must_fit(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"paper/oanet\.yaml"):
-        network_filter("oanet", None)
+        NetworkFilter.from_pretrained("oanet", None)
     path = tmp_path / "w.safetensors"
     save_pretrained(path, settle(small("pointcn")), WeightCard(architecture={}))
     with pytest.raises(CheckpointError, match=r"of 'pointcn', not of 'oanet'"):
-        network_filter("oanet", path)
+        NetworkFilter.from_pretrained("oanet", path)
     with pytest.raises(CheckpointError, match=r"of 'pointcn', not of 'geomoe'"):
         load_pretrained(path)
-    assert network_filter("pointcn", path)(Correspondences(ROWS), voxel_size=0.05).weights.any()
+    assert NetworkFilter.from_pretrained("pointcn", path)(
+        Correspondences(ROWS), voxel_size=0.05
+    ).weights.any()
     with pytest.raises(CheckpointError, match=r"judges motions"):
         NetworkFilter(tiny(motion_form="none", extra_channels=("aligned",), knn_space="source"))
     assert torch.get_num_threads() == 1

@@ -1,4 +1,4 @@
-"""The cache of described clouds: the same answers, computed once, whatever happens to its folder."""
+"""The cache of clouds with features: the same answers, computed once, whatever happens to its folder."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import EmptyCloudError, InputError, OutputError
-from geomoe3d.features.cache import DescriptionCache
-from geomoe3d.features.fpfh import describe
+from geomoe3d.features.base import with_features
+from geomoe3d.features.cache import FeatureCache, feature_identity
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.registration import Registrar
 
 CONFIG = PreparationConfig()
+FPFH = FpfhDescriptor()
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +33,17 @@ def clouds():
     return tuple(load_points(cloud.points[::8], name=cloud.name) for cloud in (source, target))
 
 
-def fetch(cache, cloud, voxel_size=0.2, viewpoint=None, config=CONFIG, seed=0):
+def fetch(cache, cloud, voxel_size=0.2, viewpoint=None, config=CONFIG, seed=0, descriptor=FPFH):
     """Through the cache; returns the described cloud and how often it was computed."""
     calls = []
 
     def make():
         calls.append(1)
         prepared = prepare(cloud, voxel_size, config, viewpoint=viewpoint, seed=seed)
-        return describe(prepared, config)
+        return with_features(prepared, descriptor)
 
-    return cache.fetch(cloud, voxel_size, viewpoint, config, seed=seed, make=make), len(calls)
+    identity = feature_identity(voxel_size, viewpoint, config, descriptor, seed)
+    return cache.fetch(cloud, identity, make), len(calls)
 
 
 def same(a, b):
@@ -54,17 +57,17 @@ def same(a, b):
 
 
 def test_the_second_time_nothing_is_computed_and_every_byte_is_the_same(tmp_path, clouds):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     first, computed = fetch(cache, clouds[0])
     assert computed == 1
-    again, computed = fetch(DescriptionCache(tmp_path), clouds[0])
+    again, computed = fetch(FeatureCache(tmp_path), clouds[0])
     assert computed == 0
     same(first, again)
 
 
 def test_a_registration_has_the_same_bytes_with_and_without_it(tmp_path, clouds):
     plain = Registrar().register(*clouds)
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     for _ in range(2):
         cached = Registrar(cache=cache).register(*clouds)
         for item in fields(plain):
@@ -79,7 +82,7 @@ def test_a_registration_has_the_same_bytes_with_and_without_it(tmp_path, clouds)
 
 
 def test_two_names_and_places_of_the_same_points_share_an_entry(tmp_path, clouds):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     fetch(cache, clouds[0])
     far = load_points(clouds[0].points, name="other")
     shifted = module.replace(far, origin=np.array([5e5, 5e6, 0.0]))
@@ -96,28 +99,29 @@ def test_two_names_and_places_of_the_same_points_share_an_entry(tmp_path, clouds
         {"viewpoint": np.zeros(3)},
         {"config": PreparationConfig(normal_neighbors=20)},
         {"seed": 1},
+        {"descriptor": FpfhDescriptor(neighbors=70)},
     ],
 )
 def test_whatever_decides_a_description_makes_another_entry(tmp_path, clouds, change):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     fetch(cache, clouds[0])
     _, computed = fetch(cache, clouds[0], **change)
     assert computed == 1
 
 
 def test_one_moved_point_or_other_code_makes_another_entry(tmp_path, clouds, monkeypatch):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     fetch(cache, clouds[0])
     points = clouds[0].points.copy()
     points[17, 1] = np.nextafter(points[17, 1], 9)
     assert fetch(cache, module.replace(clouds[0], points=points))[1] == 1
-    monkeypatch.setattr(module, "_code", lambda: "another version")
+    monkeypatch.setattr(module, "source_hash", lambda name: "another version")
     assert fetch(cache, clouds[0])[1] == 1
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "other"])
 def test_a_damaged_entry_is_made_again_with_a_warning(tmp_path, clouds, damage):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     first, _ = fetch(cache, clouds[0])
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
@@ -141,7 +145,7 @@ def test_a_damaged_entry_is_made_again_with_a_warning(tmp_path, clouds, damage):
 
 
 def test_what_was_used_longest_ago_goes_first(tmp_path, clouds):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     sizes = (0.2, 0.21, 0.22)
     for age, size in enumerate(sizes):
         before = set(tmp_path.iterdir())
@@ -150,21 +154,21 @@ def test_what_was_used_longest_ago_goes_first(tmp_path, clouds):
         os.utime(path, (1000 + age, 1000 + age))
     fetch(cache, clouds[0], 0.2)  # used now: 0.21 is the oldest
     kept = sum(path.stat().st_size for path in tmp_path.iterdir())
-    small = DescriptionCache(tmp_path, max_bytes=kept + 1)
+    small = FeatureCache(tmp_path, max_bytes=kept + 1)
     fetch(small, clouds[0], 0.23)
     assert [fetch(cache, clouds[0], size)[1] for size in (0.2, 0.22, 0.23)] == [0, 0, 0]
     assert fetch(cache, clouds[0], 0.21)[1] == 1
 
 
 def test_a_single_entry_may_exceed_the_limit_but_nothing_stays_beside_it(tmp_path, clouds):
-    cache = DescriptionCache(tmp_path, max_bytes=1)
+    cache = FeatureCache(tmp_path, max_bytes=1)
     fetch(cache, clouds[0], 0.2)
     fetch(cache, clouds[0], 0.3)
     assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_what_killed_writers_left_is_removed_after_an_hour(tmp_path, clouds):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     old, young = tmp_path / ".writing-1.npz", tmp_path / ".writing-2.npz"
     for path, age in ((old, 7200), (young, 10)):
         path.write_bytes(b"half")
@@ -175,8 +179,8 @@ def test_what_killed_writers_left_is_removed_after_an_hour(tmp_path, clouds):
 
 
 def test_many_writers_of_few_entries_never_meet_half_a_file(tmp_path, clouds):
-    expected = {size: fetch(DescriptionCache(tmp_path / "alone"), clouds[0], size)[0] for size in (0.3, 0.4)}
-    cache = DescriptionCache(tmp_path / "shared", max_bytes=200_000)  # they evict each other all the time
+    expected = {size: fetch(FeatureCache(tmp_path / "alone"), clouds[0], size)[0] for size in (0.3, 0.4)}
+    cache = FeatureCache(tmp_path / "shared", max_bytes=200_000)  # they evict each other all the time
 
     def work(number):
         size = (0.3, 0.4)[number % 2]
@@ -189,7 +193,7 @@ def test_many_writers_of_few_entries_never_meet_half_a_file(tmp_path, clouds):
 
 
 def test_a_folder_that_cannot_be_written_costs_time_only(tmp_path, clouds, monkeypatch):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
 
     def refuse(*arguments, **named):
         raise OutputError("cannot write: the disk is full")
@@ -202,15 +206,15 @@ def test_a_folder_that_cannot_be_written_costs_time_only(tmp_path, clouds, monke
 
 
 def test_errors_pass_through_and_store_nothing(tmp_path, clouds):
-    cache = DescriptionCache(tmp_path)
+    cache = FeatureCache(tmp_path)
     with pytest.raises(EmptyCloudError):
         fetch(cache, load_points(np.diag([9.0, 99.0, 999.0])))
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(InputError, match="positive"):
-        DescriptionCache(tmp_path, max_bytes=0)
+        FeatureCache(tmp_path, max_bytes=0)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot make the folder"):
-        DescriptionCache(tmp_path / "file")
+        FeatureCache(tmp_path / "file")
 
 
 # ---- a first guess, verified and not trusted -----------------------------------------------------------

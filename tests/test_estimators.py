@@ -24,7 +24,7 @@ from estimator_problems import (
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.errors import InputError
-from geomoe3d.estimators.base import make_estimator
+from geomoe3d.estimators.base import estimator as estimators
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
 from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
@@ -84,7 +84,7 @@ def test_the_unit_of_length_does_not_matter(estimator, scale: float) -> None:
     assert_motion(T, a.T_target_source, degrees=1 if loose else 1e-3, length=0.1 if loose else 1e-4)
     if scale == 1024.0 and not loose:  # a power of two leaves every digit
         np.testing.assert_array_equal(T, a.T_target_source)
-        assert b.score == a.score
+        assert b.proposal_score == a.proposal_score
 
 
 @ALL
@@ -121,7 +121,7 @@ def test_weight_zero_is_absence(estimator) -> None:
     assert len(a) == len(b) > 0
     for x, y in zip(a, b, strict=True):
         np.testing.assert_allclose(x.T_target_source, y.T_target_source, atol=1e-12)
-        assert x.score == pytest.approx(y.score, rel=1e-9)
+        assert x.proposal_score == pytest.approx(y.proposal_score, rel=1e-9)
 
 
 @ALL
@@ -268,7 +268,7 @@ def test_invalid_input_is_named(estimator, rows, weights, threshold: float, mess
 @pytest.mark.parametrize("name", ["consensus", "ransac", "svd"])
 def test_configuration_reaches_the_estimator(name: str) -> None:
     config = EstimatorConfig(name=name, num_hypotheses=3, ransac_iterations=123, ransac_confidence=0.5)
-    made = make_estimator(config)
+    made = estimators.make(config)
     expected = {
         "consensus": ConsensusEstimator(num_hypotheses=3),
         "ransac": RansacEstimator(iterations=123, confidence=0.5),
@@ -279,6 +279,8 @@ def test_configuration_reaches_the_estimator(name: str) -> None:
 
 # ---- the same answer every time ----------------------------------------------------------------------
 THREADS_SCRIPT = """
+from functools import partial
+
 import numpy as np
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.ransac import RansacEstimator
@@ -288,11 +290,12 @@ from geomoe3d.types import Correspondences
 
 def asking(estimator, rows):
     zero = np.zeros(3)
-    return estimator.with_surroundings(Surroundings.of(Correspondences(rows, viewpoints=(zero, zero)), 0.1))
+    around = Surroundings.of(Correspondences(rows, viewpoints=(zero, zero)), 0.1)
+    return partial(estimator, surroundings=around)
 
 def show(name, estimator, rows, weights):
     for h in estimator(rows, weights, inlier_threshold=0.1, seed=5):
-        print(name, len(rows), h.T_target_source.tobytes().hex(), h.score.hex(), h.num_inliers)
+        print(name, len(rows), h.T_target_source.tobytes().hex(), h.proposal_score.hex(), h.num_inliers)
 
 for seed, count in ((0, 300), (1, 1500), (2, 4000), (3, 40000)):
     rng = np.random.default_rng(seed)
@@ -341,4 +344,6 @@ def test_the_same_bytes_twice_whatever_was_drawn_before(estimator) -> None:
     estimator(rows, inlier_threshold=THRESHOLD, seed=8)
     second = estimator(rows, inlier_threshold=THRESHOLD, seed=7)
     assert [h.T_target_source.tobytes() for h in first] == [h.T_target_source.tobytes() for h in second]
-    assert [(h.score, h.num_inliers) for h in first] == [(h.score, h.num_inliers) for h in second]
+    assert [(h.proposal_score, h.num_inliers) for h in first] == [
+        (h.proposal_score, h.num_inliers) for h in second
+    ]

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from method_pairs import MOTION, correspondences, lands, pair_of
 
-import geomoe3d
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import CheckpointError, ConfigError, GeoMoE3DError, InputError
 from geomoe3d.evaluation import methods
-from geomoe3d.evaluation.methods import OURS, hash_sources, make_method, method_names
+from geomoe3d.evaluation.methods import OURS, make_method, method_names
 from geomoe3d.evaluation.records import MethodInput
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points, translation_error
 
@@ -35,7 +33,7 @@ def test_ours_land_among_wrong_correspondences(name):
     rows = correspondences(0.3)
     answer = make_method(name)(pair_of(rows))
     assert lands(answer.T_target_source)
-    assert set(answer.stages) == {"weigh", "solve"}
+    assert set(answer.stages) == {"propose"} | ({"score"} if name != "consensus" else set())
     assert answer.status is None
     assert (answer.weights is None) == (answer.inliers is None) == (name == "consensus")
     if answer.inliers is not None:
@@ -79,7 +77,7 @@ def test_same_seed_same_answer():
 def test_seed_of_the_input_reaches_the_estimator():
     rows = correspondences(0.1, count=800)
     # Too few samples among too many wrong rows: what is found depends on the draw.
-    few = ["filter.name=none", "estimator.name=ransac", "estimator.ransac_iterations=300"]
+    few = ["scoring.scorers=[surfaces]", "estimator.name=ransac", "estimator.ransac_iterations=300"]
     method = make_method("geomoe3d", few)
     answers = [method(pair_of(rows, seed=seed)).T_target_source for seed in range(6)]
     assert len({None if T is None else T.tobytes() for T in answers}) > 1
@@ -128,7 +126,7 @@ def test_clouds_give_what_a_report_needs_in_file_coordinates(room):
     assert answer.status == "ok"
     assert answer.confidence is not None
     assert answer.confidence > 0.9
-    assert "verify" in answer.stages
+    assert "score" in answer.stages
     assert "total" not in answer.stages
     rows = answer.correspondences
     assert rows is not None
@@ -171,7 +169,7 @@ def weights(tmp_path_factory):
 
 
 def network(path: Path) -> list[str]:
-    return ["filter.name=geomoe", f"filter.weights={path}"]
+    return ["scoring.scorers=[surfaces]", "filter.name=geomoe", f"filter.weights={path}"]
 
 
 def test_network_classifies_by_its_logits(weights):
@@ -187,8 +185,9 @@ def test_network_classifies_by_its_logits(weights):
 def test_identity_changes_with_the_weights(weights):
     one = make_method("geomoe3d", network(weights["plain"])).identity()
     two = make_method("geomoe3d", network(weights["other"])).identity()
-    assert one["weights_sha256"] != two["weights_sha256"]
-    assert len(one["weights_sha256"]) == 64
+    hashes = [identity["parts"]["filter"]["weights"] for identity in (one, two)]
+    assert hashes[0] != hashes[1]
+    assert len(hashes[0]) == 64
     assert "torch" in one["versions"]
 
 
@@ -202,16 +201,17 @@ def test_missing_weights_are_refused_before_any_pair():
         make_method("geomoe3d", network(Path("nowhere.safetensors")))
 
 
-def test_network_without_torch_is_absent(weights, monkeypatch):
+def test_network_without_torch_is_absent(monkeypatch):
+    shipped = make_method("geomoe").identity()["parts"]["network"]["weights"]
     find = methods.importlib.util.find_spec
     monkeypatch.setattr(
         methods.importlib.util,
         "find_spec",
         lambda name, *rest: None if name == "torch" else find(name, *rest),
     )
-    method = make_method("geomoe3d", network(weights["plain"]))
+    method = make_method("geomoe")
     assert "pip install torch" in method.absent()
-    assert method.identity()["weights_sha256"] is None
+    assert method.identity()["parts"]["network"]["weights"] == shipped
     assert make_method("geomoe3d").absent() is None
 
 
@@ -246,7 +246,7 @@ def test_every_name_makes_a_method_with_a_plain_identity():
 
 def test_identities_differ_where_answers_may():
     seen = [json.dumps(make_method(name).identity(), sort_keys=True) for name in method_names()]
-    assert len(set(seen)) == len(seen) - 1  # geomoe3d without further settings is consensus
+    assert len(set(seen)) == len(seen) - 1  # geomoe3d without further settings is geomoe
     plain = make_method("geomoe3d").identity()
     assert make_method("geomoe3d", ["matching.neighbors=2"]).identity() != plain
     assert make_method("geomoe3d", ["estimator.inlier_threshold=2"]).identity() != plain
@@ -261,31 +261,3 @@ def test_assignments_are_for_geomoe3d_alone():
         make_method("geomoe3d", ["matching.neighbours=2"])
     with pytest.raises(ConfigError, match="seed"):
         make_method("geomoe3d", ["seed=2"])
-
-
-def test_source_hash_follows_what_decides_and_nothing_else(tmp_path):
-    package = Path(geomoe3d.__file__).parent
-    copy = tmp_path / "geomoe3d"
-    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.pyi"))
-    before = hash_sources(copy)
-    assert before == hash_sources(copy)
-    for name in ("evaluation/methods.py", "cli/main.py", "visual/page.py", "data/draw.py", "doctor.py"):
-        with (copy / name).open("a", encoding="utf-8") as stream:
-            stream.write("\n")
-    assert hash_sources(copy) == before
-    for name in (
-        "geometry/rigid_fit.py",
-        "clouds/formats/ply.py",
-        "filters/folded.py",
-        "estimators/consensus.py",
-        "judge.py",
-        "registration.py",
-        "verification.py",
-    ):
-        with (copy / name).open("a", encoding="utf-8") as stream:
-            stream.write("\n")
-        after = hash_sources(copy)
-        assert after != before
-        before = after
-    (copy / "a_new_stage.py").write_text("", encoding="utf-8")
-    assert hash_sources(copy) != before

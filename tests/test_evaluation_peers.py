@@ -95,7 +95,7 @@ def test_lands_on_clouds(name, room):
     assert rotation_error_deg(answer.T_target_source, T) < 15  # the benchmark's rule: no refinement follows
     assert translation_error(answer.T_target_source, T) < 0.30
     assert all(seconds >= 0 for seconds in answer.stages.values())
-    assert answer.stages["describe"] > 0
+    assert answer.stages["features"] > 0
 
 
 @pytest.mark.parametrize("name", LOCAL)

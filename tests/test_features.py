@@ -8,15 +8,17 @@ from surface_pairs import corner
 
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
-from geomoe3d.features.fpfh import describe, flip_normals
+from geomoe3d.features.base import with_features, with_normals_flipped
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.types import PointCloud
 
+FPFH = FpfhDescriptor()
 CONFIG = PreparationConfig(viewpoint="centroid")  # a guess costs time and is tested by itself
 
 
 def test_features_are_unit_and_turn_with_nothing() -> None:
     points = corner(np.random.default_rng(11), noise=0.003)
-    made = describe(prepare(PointCloud(points), 0.1, CONFIG), CONFIG)
+    made = with_features(prepare(PointCloud(points), 0.1, CONFIG), FPFH)
     assert made.features.shape == (len(made), 33)
     assert made.features.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(made.features, axis=1), 1, atol=1e-4)
@@ -24,7 +26,7 @@ def test_features_are_unit_and_turn_with_nothing() -> None:
     from dataclasses import replace
 
     moved = replace(made, points=made.points @ R.T + [1, 2, 3], normals=made.normals @ R.T)
-    again = describe(moved, CONFIG)
+    again = with_features(moved, FPFH)
     distance = np.linalg.norm(again.features - made.features, axis=1)
     assert np.median(distance) < 1e-3
     assert (distance < 0.1).mean() > 0.98
@@ -39,7 +41,7 @@ def test_a_point_without_neighbours_has_a_zero_feature() -> None:
         points=np.vstack([made.points, [[90.0, 0, 0]]]),
         normals=np.vstack([made.normals, [[0.0, 0, 1]]]),
     )
-    features = describe(lonely, CONFIG).features
+    features = with_features(lonely, FPFH).features
     assert np.isfinite(features).all()
     assert (features[-1] == 0).all()
 
@@ -47,11 +49,11 @@ def test_a_point_without_neighbours_has_a_zero_feature() -> None:
 def test_normals_turned_over_are_another_cloud_and_turned_back_the_same() -> None:
     config = PreparationConfig(viewpoint="origin")
     cloud = PointCloud(corner(np.random.default_rng(13), noise=0.003) + 1.0)
-    made = describe(prepare(cloud, 0.1, config, viewpoint=np.zeros(3)), config)
-    over = flip_normals(made, config)
+    made = with_features(prepare(cloud, 0.1, config, viewpoint=np.zeros(3)), FPFH)
+    over = with_normals_flipped(made, FPFH)
     np.testing.assert_array_equal(over.normals, -made.normals)
     assert over.viewpoint is None
     changed = np.linalg.norm(over.features - made.features, axis=1)
     assert (changed > 0.1).mean() > 0.1  # plain walls look alike from both sides, edges do not
-    back = flip_normals(over, config)
+    back = with_normals_flipped(over, FPFH)
     np.testing.assert_array_equal(back.features, made.features)

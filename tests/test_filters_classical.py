@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.config import FilterConfig
+from geomoe3d.config import FilterConfig, load_config
 from geomoe3d.errors import ConfigError
-from geomoe3d.filters.base import FilterOutput, NoFilter, filter_names, make_filter, resolve_filter
+from geomoe3d.filters.base import NoFilter, outlier_filter
 from geomoe3d.filters.spectral import SpectralFilter
-from geomoe3d.types import Correspondences
+from geomoe3d.pipeline import resolved
+from geomoe3d.types import Correspondences, FilterOutput
 
 VOXEL = 0.05
 
@@ -42,7 +43,7 @@ def test_one_weight_in_range_for_every_correspondence(name: str, count: int) -> 
     rows, _ = problem(0, max(count, 1))
     rows = rows[:count]
     before = rows.copy()
-    output = make_filter(name)(Correspondences(rows), voxel_size=VOXEL)
+    output = outlier_filter.make(FilterConfig(name=name))(Correspondences(rows), voxel_size=VOXEL)
     assert isinstance(output, FilterOutput)
     assert output.weights.shape == (count,)
     assert output.weights.dtype == np.float64
@@ -56,22 +57,25 @@ def test_no_filter_gives_all_the_same() -> None:
 
 
 def test_names_are_those_that_can_be_made_and_others_name_the_nearest() -> None:
-    assert {"none", "spectral"} <= set(filter_names())
+    assert {"none", "spectral"} <= set(outlier_filter.names())
     with pytest.raises(ConfigError, match="'spectrl'; did you mean 'spectral'"):
-        make_filter("spectrl")
+        outlier_filter.make(FilterConfig(name="spectrl"))
     with pytest.raises(ConfigError, match=r"known: .*none.*spectral"):
-        make_filter("zzzzzz")
+        outlier_filter.make(FilterConfig(name="zzzzzz"))
 
 
 def test_auto_takes_the_network_where_it_can_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert resolve_filter(FilterConfig()).name == "geomoe"
-    assert resolve_filter(FilterConfig(name="spectral")).name == "spectral"
+    def scorers(*assignments: str) -> object:
+        return resolved(load_config(None, list(assignments))).scoring.scorers
+
+    assert scorers() == ("surfaces", "network")
+    assert scorers("scoring.scorers=[surfaces]") == ("surfaces",)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert resolve_filter(FilterConfig()).name == "none"
-    assert resolve_filter(FilterConfig(weights="mine.safetensors")).name == "geomoe"  # and says what lacks
+    assert scorers() == ("surfaces",)
+    assert scorers("scoring.weights=mine.safetensors") == ("surfaces", "network")  # and says what lacks
     monkeypatch.undo()
-    monkeypatch.setattr("geomoe3d.filters.base.packaged_names", list)
-    assert resolve_filter(FilterConfig()).name == "none"
+    monkeypatch.setattr("geomoe3d.pipeline.packaged_names", list)
+    assert scorers() == ("surfaces",)
 
 
 @pytest.mark.parametrize("seed", range(4))

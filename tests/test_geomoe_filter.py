@@ -14,7 +14,7 @@ import torch
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, InputError, OutputError
-from geomoe3d.filters.network import GeoMoEFilter, geomoe_filter
+from geomoe3d.filters.geomoe import GeoMoEFilter
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.networks.inputs import collate, pair_input
@@ -117,7 +117,7 @@ def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
     assert not model.training
     assert (card.steps, card.metrics, card.commit, card.training_data) == (7, {"f1": 0.5}, "abc", "made up")
     points, voxel_size = correspondences()
-    first = geomoe_filter(path)(points, voxel_size=voxel_size)
+    first = GeoMoEFilter.from_pretrained(path)(points, voxel_size=voxel_size)
     second = GeoMoEFilter(original)(points, voxel_size=voxel_size)
     np.testing.assert_array_equal(first.weights, second.weights)
     with pytest.raises(OutputError, match="exists"):
@@ -184,7 +184,7 @@ def test_using_a_filter_imports_no_training_and_no_compiler() -> None:
     code = (
         "import sys, numpy as np\n"
         "from geomoe3d.networks.geomoe import GeoMoE\n"
-        "from geomoe3d.filters.network import GeoMoEFilter\n"
+        "from geomoe3d.filters.geomoe import GeoMoEFilter\n"
         "from geomoe3d.types import Correspondences\n"
         "points = Correspondences(np.random.default_rng(0).normal(size=(50, 6)))\n"
         "GeoMoEFilter(GeoMoE())(points, voxel_size=0.1)\n"

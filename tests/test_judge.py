@@ -12,11 +12,20 @@ from scipy.spatial import cKDTree
 from surface_pairs import VOXEL, motion, pair, perturbation, prepared, surfaces
 
 import geomoe3d
-from geomoe3d.config import JudgementConfig
+from geomoe3d.config import DecisionConfig
 from geomoe3d.data.sample import make_sample_pair
-from geomoe3d.decision.confidence import Information, confidence_score, judge, lead_over, measure_information
+from geomoe3d.decision import confidence
+from geomoe3d.decision.confidence import (
+    Information,
+    Judgement,
+    confidence_score,
+    lead_over,
+    measure_information,
+)
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
+from geomoe3d.scoring.network import Opinion
 from geomoe3d.scoring.surfaces import Evidence
+from geomoe3d.types import Hypothesis
 
 # ---- the information of a fit ---------------------------------------------------------------------------
 
@@ -174,51 +183,63 @@ def evidence(score: float, overlap: float = 0.6, violation: float = 0.0) -> Evid
     return Evidence(overlap, overlap, score * np.exp(10 * violation), violation)
 
 
+def scored(found: Evidence, verdict: float | None = None) -> Hypothesis:
+    """A hypothesis of which the clouds say this, and a network that."""
+    said = {} if verdict is None else {"network": Opinion(verdict)}
+    return Hypothesis(np.eye(4), scores={"surfaces": found, **said})
+
+
+def judge(
+    found: Evidence, lead: float, support: float, information: Information, config: DecisionConfig
+) -> Judgement:
+    return confidence.judge(scored(found), None, lead, support, information, config)
+
+
 def test_strong_evidence_with_a_lead_is_ok() -> None:
-    judged = judge(evidence(0.8), 5.0, 0.05, FIRM, JudgementConfig())
+    judged = judge(evidence(0.8), 5.0, 0.05, FIRM, DecisionConfig())
     assert judged.status == "ok"
     assert judged.reasons == ()
     assert judged.confidence > 0.9
 
 
 def test_weak_evidence_is_low_confidence_and_says_so() -> None:
-    judged = judge(evidence(0.05), 1.5, 0.05, FIRM, JudgementConfig())
+    judged = judge(evidence(0.05), 1.5, 0.05, FIRM, DecisionConfig())
     assert judged.status == "low_confidence"
     assert judged.confidence < 0.95
     assert any(re.search(r"confidence 0\.\d\d is below 0\.95", reason) for reason in judged.reasons)
 
 
 def test_a_rival_about_as_good_is_ambiguous() -> None:
-    judged = judge(evidence(0.8), 1.1, 0.05, FIRM, JudgementConfig())
+    judged = judge(evidence(0.8), 1.1, 0.05, FIRM, DecisionConfig())
     assert judged.status == "ambiguous"
     assert judged.confidence <= 0.5
     assert any("91 %" in reason for reason in judged.reasons)
-    limit = 1 / JudgementConfig().ambiguity_ratio
-    assert judge(evidence(2.0), limit * 1.001, 0.05, FIRM, JudgementConfig()).status != "ambiguous"
-    assert judge(evidence(2.0), limit * 0.999, 0.05, FIRM, JudgementConfig()).status == "ambiguous"
+    limit = 1 / DecisionConfig().ambiguity_ratio
+    assert judge(evidence(2.0), limit * 1.001, 0.05, FIRM, DecisionConfig()).status != "ambiguous"
+    assert judge(evidence(2.0), limit * 0.999, 0.05, FIRM, DecisionConfig()).status == "ambiguous"
     # Where even without a rival nothing would be believed, the rival is not the reason.
-    assert judge(evidence(0.002), 1.1, 0.05, FIRM, JudgementConfig()).status == "low_confidence"
+    assert judge(evidence(0.002), 1.1, 0.05, FIRM, DecisionConfig()).status == "low_confidence"
 
 
 def test_a_surface_that_slides_is_ambiguous_whatever_the_evidence() -> None:
     for score, lead in ((5.0, 30.0), (0.01, 1.0)):
-        judged = judge(evidence(score), lead, 0.05, LOOSE, JudgementConfig())
+        judged = judge(evidence(score), lead, 0.05, LOOSE, DecisionConfig())
         assert judged.status == "ambiguous"
         assert judged.confidence <= 0.3
         assert any("slide" in reason for reason in judged.reasons)
 
 
 def test_little_overlap_and_violated_free_space_are_told_even_when_ok() -> None:
-    judged = judge(evidence(2.0, overlap=0.09), 10.0, 0.05, FIRM, JudgementConfig())
+    judged = judge(evidence(2.0, overlap=0.09), 10.0, 0.05, FIRM, DecisionConfig())
     assert judged.status == "ok"
     assert any("overlap 9 %" in reason for reason in judged.reasons)
-    judged = judge(evidence(2.0, violation=0.12), 10.0, 0.05, FIRM, JudgementConfig())
+    judged = judge(evidence(2.0, violation=0.12), 10.0, 0.05, FIRM, DecisionConfig())
     assert any("free space" in reason and "0.12" in reason for reason in judged.reasons)
 
 
 def test_nothing_scored_is_never_ok() -> None:
     for lead in (1.0, 3.0, np.inf):
-        judged = judge(evidence(0.0), lead, 0.05, FIRM, JudgementConfig())
+        judged = judge(evidence(0.0), lead, 0.05, FIRM, DecisionConfig())
         assert judged.status == "low_confidence"
         assert judged.confidence == 0
 
@@ -226,7 +247,7 @@ def test_nothing_scored_is_never_ok() -> None:
 @pytest.mark.parametrize("least", [0.0, 0.5, 0.99])
 def test_the_threshold_is_the_users(least: float) -> None:
     for score, lead in itertools.product((0.05, 0.2, 0.5, 2.0), (1.5, 5.0)):
-        judged = judge(evidence(score), lead, 0.05, FIRM, JudgementConfig(min_confidence=least))
+        judged = judge(evidence(score), lead, 0.05, FIRM, DecisionConfig(min_confidence=least))
         assert (judged.status == "ok") == (judged.confidence >= least)
 
 
@@ -247,33 +268,37 @@ def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:
 
 def test_confidence_rises_with_hold_and_falls_with_looseness_and_violation_up_to_a_bound() -> None:
     for verdict in (None, 2.0):
-        sure = Evidence(0.5, 0.5, 0.3, 0.0, verdict)
+        sure, heard = Evidence(0.5, 0.5, 0.3, 0.0), verdict is not None
         held = [replace(FIRM, observability=x) for x in (0.0, 0.005, 0.05, 0.3)]
-        by_hold = [confidence_score(sure, 3.0, 0.05, x) for x in held]
+        by_hold = [confidence_score(sure, 3.0, 0.05, x, heard=heard) for x in held]
         assert np.isfinite(by_hold).all()
         assert (np.diff(by_hold) > 0).all()
         loose = [replace(FIRM, looseness=x) for x in (0.02, 0.1, 1.0, 10.0, 1000.0)]
-        by_looseness = [confidence_score(sure, 3.0, 0.05, x) for x in loose]
+        by_looseness = [confidence_score(sure, 3.0, 0.05, x, heard=heard) for x in loose]
         assert (np.diff(by_looseness[:4]) < 0).all()
         assert by_looseness[4] == by_looseness[3]
-        floating = [Evidence(0.5, 0.5, 0.3 * np.exp(10 * x), x, verdict) for x in (0.0, 0.02, 0.1, 0.4)]
-        by_violation = [confidence_score(e, 3.0, 0.05, FIRM) for e in floating]  # at equal surface score
+        floating = [Evidence(0.5, 0.5, 0.3 * np.exp(10 * x), x) for x in (0.0, 0.02, 0.1, 0.4)]
+        by_violation = [
+            confidence_score(e, 3.0, 0.05, FIRM, heard=heard) for e in floating
+        ]  # at equal surface score
         assert (np.diff(by_violation[:3]) < 0).all()
         assert by_violation[3] == pytest.approx(by_violation[2])
 
 
 @pytest.mark.parametrize("verdict", [None, 2.0])
 def test_where_free_space_was_not_asked_the_same_evidence_is_worth_less(verdict: float | None) -> None:
-    found = Evidence(0.3, 0.3, 0.25, 0.0, verdict)
+    found, heard = Evidence(0.3, 0.3, 0.25, 0.0), verdict is not None
     blind = replace(FIRM, sensors_known=False)
     for lead in (1.0, 1.5, 3.0):
-        assert confidence_score(found, lead, 0.05, blind) < confidence_score(found, lead, 0.05, FIRM)
+        one, other = (confidence_score(found, lead, 0.05, x, heard=heard) for x in (blind, FIRM))
+        assert one < other
 
 
 def test_the_networks_verdict_counts_by_the_lead_alone() -> None:
     """It says what fits better, of motions of the same scans; how sure it is by itself is not believed."""
-    at = [confidence_score(Evidence(0.5, 0.5, 0.3, 0.0, x), 3.0, 0.05, FIRM) for x in (-5.0, 2.0)]
-    assert at[0] == at[1]
+    found, config = Evidence(0.5, 0.5, 0.3, 0.0), DecisionConfig()
+    at = [confidence.judge(scored(found, x), None, 3.0, 0.05, FIRM, config).confidence for x in (-5.0, 2.0)]
+    assert at[0] == at[1] == confidence_score(found, 3.0, 0.05, FIRM, heard=True)
 
 
 def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:
@@ -284,22 +309,24 @@ def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence(
 
 
 def test_lead_over_the_other() -> None:
-    assert lead_over(evidence(0.6), evidence(0.2)) == pytest.approx(3)
-    assert lead_over(evidence(0.2), evidence(0.6)) == pytest.approx(1 / 3)
-    assert lead_over(evidence(0.6), evidence(0.0)) == np.inf
-    assert lead_over(evidence(0.0), evidence(0.0)) == 1
-    assert lead_over(evidence(0.0), None) == 1
+    assert lead_over(0.6, 0.2) == pytest.approx(3)
+    assert lead_over(0.2, 0.6) == pytest.approx(1 / 3)
+    assert lead_over(0.6, 0.0) == np.inf
+    assert lead_over(0.0, 0.0) == 1
+    assert lead_over(0.0, None) == 1
     # An answer without a rival has beaten none: more than a tie, less than a clear victory.
-    assert 1 < lead_over(evidence(0.6), None) < 10
+    assert 1 < lead_over(0.6, None) < 10
 
 
-@pytest.mark.parametrize(("name", "least"), [("none", 0.8), ("geomoe", 0.05)])
+@pytest.mark.parametrize(("name", "least"), [("surfaces", 0.8), ("surfaces, network", 0.05)])
 def test_a_scene_that_stands_twice_in_the_target_is_ambiguous(name: str, least: float) -> None:
     """A room with two halves alike, seen from its middle: both places are right, and the answer knows it."""
     source, target, T = make_sample_pair(0)
     half_turn = np.diag([-1.0, 1, -1, 1])
     twice = np.vstack([target.file_points, transform_points(half_turn, target.file_points)])
-    answer = geomoe3d.register(source.file_points, twice, voxel_size=0.07, filter={"name": name})
+    answer = geomoe3d.register(
+        source.file_points, twice, voxel_size=0.07, scoring={"scorers": name.split(", ")}
+    )
     places = [T, half_turn @ T]
     errors = [rotation_error_deg(answer.T_target_source, place) for place in places]
     assert min(errors) < 1
@@ -320,7 +347,7 @@ def test_a_scene_that_stands_twice_in_the_target_is_ambiguous(name: str, least: 
 def test_a_rival_makes_ambiguous_only_where_clouds_and_network_like_it_alike(
     surface: float, verdicts: tuple[float, float], status: str
 ) -> None:
-    mine = replace(evidence(0.8, overlap=0.5), verdict=verdicts[0])
-    rival = replace(evidence(surface, overlap=0.5), verdict=verdicts[1])
-    judged = judge(mine, 5.0, 0.3, FIRM, JudgementConfig(min_confidence=0.5), rival)
+    mine = scored(evidence(0.8, overlap=0.5), verdicts[0])
+    rival = scored(evidence(surface, overlap=0.5), verdicts[1])
+    judged = confidence.judge(mine, rival, 5.0, 0.3, FIRM, DecisionConfig(min_confidence=0.5))
     assert judged.status == status

@@ -9,6 +9,7 @@ import pytest
 from corner_scenes import AT_ZERO, VOXEL, scene
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
@@ -131,7 +132,7 @@ def test_hypotheses_count_the_inliers_of_the_motion_drawn_closer() -> None:
     (found,) = KeypointAligner(rows, THRESHOLD).hypotheses([before])
     gaps = residuals(found.T_target_source, rows[:, :3], rows[:, 3:])
     assert found.num_inliers == (gaps < THRESHOLD).sum() > 90
-    assert found.score == 7.0
+    assert found.proposal_score == 7.0
 
 
 @pytest.mark.parametrize("normals", [False, True])
@@ -143,11 +144,9 @@ def test_proposals_of_clouds_are_left_to_the_clouds(normals: bool) -> None:
     def motions(count: int) -> list[bytes]:
         found = propose(
             ConsensusEstimator(num_hypotheses=8),
-            given,
+            Pair(given, THRESHOLD / 2, THRESHOLD),
             np.ones(len(rows)),
             EstimatorConfig(num_aligned=count),
-            inlier_threshold=THRESHOLD,
-            seed=0,
         )
         return [h.T_target_source.tobytes() for h in found]
 
@@ -160,11 +159,9 @@ def test_so_many_proposals_are_drawn_closer_as_the_configuration_says() -> None:
     def run(count: int) -> list[Any]:
         return propose(
             ConsensusEstimator(num_hypotheses=8),
-            Correspondences(rows, viewpoints=AT_ZERO),
+            Pair(Correspondences(rows, viewpoints=AT_ZERO), THRESHOLD / 2, THRESHOLD),
             np.ones(len(rows)),
             EstimatorConfig(num_aligned=count),
-            inlier_threshold=THRESHOLD,
-            seed=0,
         )
 
     none, some = run(0), run(3)
@@ -173,5 +170,5 @@ def test_so_many_proposals_are_drawn_closer_as_the_configuration_says() -> None:
     ]
     assert any(differs[:3])
     assert not any(differs[3:])
-    assert [h.score for h in none] == [h.score for h in some]
+    assert [h.proposal_score for h in none] == [h.proposal_score for h in some]
     assert translation_error(some[0].T_target_source, T) < translation_error(none[0].T_target_source, T)

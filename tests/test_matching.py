@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geomoe3d.clouds import matching
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
+from geomoe3d.matching import nearest as matching
 from geomoe3d.matching.nearest import match, nearest_features
 from geomoe3d.types import PreparedCloud
 
@@ -125,7 +125,7 @@ def test_zero_features_are_equally_far_from_all() -> None:
 
 def test_one_way_gives_every_source_point_its_nearest_target() -> None:
     source, target = pair()
-    found = match(source, target, MatchingConfig(method="one_way"))
+    found = match(source, target, MatchingConfig(name="one_way"))
     distances = brute_force(source.features, target.features)
     np.testing.assert_array_equal(found.source_index, np.arange(60))
     np.testing.assert_array_equal(found.target_index, distances.argmin(1))
@@ -139,7 +139,7 @@ def test_one_way_gives_every_source_point_its_nearest_target() -> None:
 @pytest.mark.parametrize("k", [2, 3])
 def test_more_neighbours_give_more_rows_each(k: int) -> None:
     source, target = pair()
-    found = match(source, target, MatchingConfig(method="one_way", neighbors=k))
+    found = match(source, target, MatchingConfig(name="one_way", neighbors=k))
     order = np.argsort(brute_force(source.features, target.features), axis=1)[:, :k]
     np.testing.assert_array_equal(found.source_index, np.repeat(np.arange(60), k))
     np.testing.assert_array_equal(found.target_index, order.ravel())
@@ -150,7 +150,7 @@ def test_mutual_keeps_pairs_that_are_each_others_nearest_and_does_not_mind_the_d
     distances = brute_force(source.features, target.features)
     expected = {(i, j) for i, j in enumerate(distances.argmin(1)) if distances[:, j].argmin() == i}
     assert 20 < len(expected) < 60
-    config = MatchingConfig(method="mutual")
+    config = MatchingConfig(name="mutual")
     forth, back = match(source, target, config), match(target, source, config)
     assert set(zip(forth.source_index, forth.target_index, strict=True)) == expected
     assert set(zip(back.target_index, back.source_index, strict=True)) == expected
@@ -159,7 +159,7 @@ def test_mutual_keeps_pairs_that_are_each_others_nearest_and_does_not_mind_the_d
 
 def test_mutual_with_more_neighbours_still_means_each_others_nearest() -> None:
     source, target = pair()
-    one, three = (match(source, target, MatchingConfig(method="mutual", neighbors=k)) for k in (1, 3))
+    one, three = (match(source, target, MatchingConfig(name="mutual", neighbors=k)) for k in (1, 3))
     assert set(zip(three.source_index, three.target_index, strict=True)) == set(
         zip(one.source_index, one.target_index, strict=True)
     )
@@ -170,7 +170,7 @@ def test_ratio_keeps_the_clearly_better(limit: float) -> None:
     source, target = pair()
     ranked = np.sort(brute_force(source.features, target.features), axis=1)
     expected = np.flatnonzero(ranked[:, 0] <= limit * ranked[:, 1])
-    found = match(source, target, MatchingConfig(method="ratio", max_ratio=limit))
+    found = match(source, target, MatchingConfig(name="ratio", max_ratio=limit))
     np.testing.assert_array_equal(found.source_index, expected)
     assert (found.ratio <= limit).all()
     assert limit == 1.0 or 0 < len(found) < 60
@@ -179,9 +179,7 @@ def test_ratio_keeps_the_clearly_better(limit: float) -> None:
 def test_single_points_match() -> None:
     features = unit_features(np.random.default_rng(6), 1)
     for method in ("one_way", "mutual", "ratio"):
-        found = match(
-            cloud(features), cloud(features), MatchingConfig(method=method, max_ratio=1, neighbors=3)
-        )
+        found = match(cloud(features), cloud(features), MatchingConfig(name=method, max_ratio=1, neighbors=3))
         assert len(found) == 1
 
 
@@ -190,7 +188,7 @@ def test_clouds_without_features_are_refused() -> None:
     from dataclasses import replace
 
     for a, b in ((replace(source, features=None), target), (source, replace(target, features=None))):
-        with pytest.raises(InputError, match="describe"):
+        with pytest.raises(InputError, match="with_features"):
             match(a, b, MatchingConfig())
 
 
@@ -234,8 +232,8 @@ def test_the_filling_choice_is_spread_over_the_cloud() -> None:
 @pytest.mark.parametrize("method", ["mutual", "ratio"])
 def test_the_limit_applies_after_the_method(method: str) -> None:
     source, target = pair(n=300, m=200)
-    plain = match(source, target, MatchingConfig(method=method, max_ratio=0.9))
-    few = match(source, target, MatchingConfig(method=method, max_ratio=0.9, max_correspondences=10))
+    plain = match(source, target, MatchingConfig(name=method, max_ratio=0.9))
+    few = match(source, target, MatchingConfig(name=method, max_ratio=0.9, max_correspondences=10))
     assert len(plain) > 10 == len(few)
     assert set(few.source_index) <= set(plain.source_index)
 

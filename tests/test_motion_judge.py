@@ -1,9 +1,9 @@
-"""A network that judges motions as a filter: the same verdict folded, padded and on any number of threads."""
+"""A network that judges motions, and bare correspondences that it scores: the same folded, padded, threaded."""
 
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,19 +11,58 @@ import torch
 from corner_scenes import AT_ZERO, VOXEL, scene
 from judged_motions import network, turned
 
-from geomoe3d.config import EstimatorConfig, build_config
+from geomoe3d import correspondence_registration
+from geomoe3d.clouds.pair import Pair
+from geomoe3d.config import EstimatorConfig, RegistrationConfig, build_config
+from geomoe3d.correspondence_registration import CorrespondenceRegistrar, likeliest_rows
 from geomoe3d.errors import CheckpointError
 from geomoe3d.estimators.consensus import ConsensusEstimator
-from geomoe3d.filters.motion_judge import MotionJudge, likeliest_rows
-from geomoe3d.filters.network import GeoMoEFilter
+from geomoe3d.filters.geomoe import GeoMoEFilter
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.folded import FoldedGeoMoE
 from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.networks.inputs import MotionInputs, collate
-from geomoe3d.types import Correspondences, Hypothesis
+from geomoe3d.networks.motion_judge import MotionJudge
+from geomoe3d.pipeline import Pipeline
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.network import NetworkScorer, opinion_of
+from geomoe3d.types import Correspondences, FloatArray, Hypothesis
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+class Given(NetworkScorer):
+    """A network that a test has made."""
+
+    def __init__(self, judge: MotionJudge) -> None:
+        self.__dict__["_judge"] = judge
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Hypotheses that a network has looked at, those it was not asked about, and the weights under the best."""
+
+    hypotheses: list[Hypothesis]
+    weights: FloatArray
+    logits: FloatArray | None
+
+    @property
+    def verdicts(self) -> list[float]:
+        found = [opinion_of(h) for h in self.hypotheses]
+        return [opinion.verdict for opinion in found if opinion is not None]
+
+
+def weigh(given: Correspondences, estimator: EstimatorConfig | None = None) -> Weighed:
+    """What bare correspondences come to with an untrained network."""
+    config = RegistrationConfig(estimator=estimator or EstimatorConfig(), scoring={"scorers": ["surfaces"]})
+    pipeline = Pipeline(config)
+    pipeline.scorers["network"] = Given(MotionJudge(network()))
+    threshold = config.estimator.inlier_threshold * VOXEL
+    found, output = CorrespondenceRegistrar.of(pipeline).hypotheses(
+        Pair(given, VOXEL, threshold), StageClock()
+    )
+    return Weighed(found, output.weights, output.logits)
 
 
 @pytest.mark.parametrize("changes", [{}, {"prior": "none"}, {"feed_forward": "dense"}])
@@ -65,22 +104,21 @@ def test_padding_changes_no_verdict() -> None:
     torch.testing.assert_close(padded[:1], plain, atol=1e-4, rtol=1e-4)
 
 
-def test_filter_judges_what_consensus_proposes() -> None:
+def test_a_network_scores_what_consensus_proposes() -> None:
     rows, _ = scene(4)
-    found = MotionJudge(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
+    found = weigh(Correspondences(rows, viewpoints=AT_ZERO))
     assert found.hypotheses
-    verdicts = [h.verdict for h in found.hypotheses if h.verdict is not None]
-    assert verdicts == sorted(verdicts, reverse=True)
+    assert found.verdicts == sorted(found.verdicts, reverse=True)
     assert found.weights.shape == (len(rows),)
     assert found.logits is not None
-    again = MotionJudge(network())(Correspondences(rows, viewpoints=AT_ZERO), voxel_size=VOXEL)
+    again = weigh(Correspondences(rows, viewpoints=AT_ZERO))
     np.testing.assert_array_equal(again.weights, found.weights)
 
 
 def test_each_network_has_its_own_filter() -> None:
-    with pytest.raises(CheckpointError, match="MotionJudge"):
+    with pytest.raises(CheckpointError, match=r"scoring\.weights"):
         GeoMoEFilter(network())
-    with pytest.raises(CheckpointError, match="GeoMoEFilter"):
+    with pytest.raises(CheckpointError, match=r"filter\.weights"):
         MotionJudge(GeoMoE(build_config(NetworkConfig, {"num_layers": 1, "width": 8, "num_heads": 2})))
 
 
@@ -94,48 +132,42 @@ def test_mutual_rows_come_first() -> None:
     assert likeliest_rows(few, 120, 0) is few
 
 
-def test_more_rows_than_are_judged_are_all_weighed_wherever_they_stand() -> None:
+def test_more_rows_than_are_scored_are_all_weighed_wherever_they_stand() -> None:
     rows, _ = scene(4, count=1500)
     rows = rows[np.argsort(rows[:, 0])]
-    rows[:3] = np.nan
     few = likeliest_rows(Correspondences(rows), 1000, 0)
-    assert np.nanmax(few.source[:, 0]) > 0.9 * np.nanmax(rows[:, 0])  # spread, not the first thousand
-    rows = np.vstack([np.full((1000, 6), np.nan), rows])
-    found = MotionJudge(network())(Correspondences(rows), voxel_size=VOXEL)
+    assert few.source[:, 0].max() > 0.9 * rows[:, 0].max()  # spread, not the first thousand
+    found = weigh(Correspondences(rows))
     assert found.hypotheses
-    assert found.weights.shape == (2500,)
-    assert not found.weights[:1003].any()
+    assert found.weights.shape == (1500,)
     assert found.logits is not None
-    assert np.isfinite(found.logits[1003:]).all()
+    assert np.isfinite(found.logits).all()
 
 
 @pytest.mark.parametrize(("convinced", "looked_at"), [(-100.0, 2), (100.0, 6)])
-def test_a_filter_stops_where_it_has_seen_enough(
+def test_a_network_stops_where_it_has_seen_enough(
     convinced: float, looked_at: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("geomoe3d.filters.motion_judge.CONVINCED", convinced)
-    found = MotionJudge(network())(Correspondences(scene(3)[0], viewpoints=AT_ZERO), voxel_size=VOXEL)
-    verdicts = [h.verdict for h in found.hypotheses if h.verdict is not None]
-    assert len(verdicts) == looked_at < len(found.hypotheses)
-    assert verdicts == sorted(verdicts, reverse=True)
+    monkeypatch.setattr(correspondence_registration, "CONVINCED", convinced)
+    found = weigh(Correspondences(scene(3)[0], viewpoints=AT_ZERO))
+    assert len(found.verdicts) == looked_at < len(found.hypotheses)
+    assert found.verdicts == sorted(found.verdicts, reverse=True)
 
 
 @pytest.mark.parametrize(
     ("convinced", "num_aligned", "moved"), [(-100.0, 1, {1}), (-100.0, 6, {2}), (100.0, 6, {3, 4, 5, 6})]
 )
-def test_a_filter_draws_closer_what_it_looks_at(
+def test_what_the_network_looks_at_is_drawn_closer(
     convinced: float, num_aligned: int, moved: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("geomoe3d.filters.motion_judge.CONVINCED", convinced)
+    monkeypatch.setattr(correspondence_registration, "CONVINCED", convinced)
     monkeypatch.setattr("geomoe3d.estimators.keypoint_alignment._KEPT_AGREEMENT", 0.0)  # wrong ones slide
     # The same proposals whether or not they are drawn closer.
-    monkeypatch.setattr("geomoe3d.filters.motion_judge._NUM_SEEDS", ConsensusEstimator().num_seeds)
-    monkeypatch.setattr("geomoe3d.filters.motion_judge._NUM_REFINED", ConsensusEstimator().num_refined)
+    monkeypatch.setattr(ConsensusEstimator, "with_less_effort", lambda self: self)
     rows, _ = scene(3, share=0.1)
 
     def found(count: int, given: Correspondences) -> list[Hypothesis]:
-        judge = MotionJudge(network(), estimator=EstimatorConfig(num_aligned=count))
-        return list(judge(given, voxel_size=VOXEL).hypotheses)
+        return weigh(given, EstimatorConfig(num_aligned=count)).hypotheses
 
     def motions(hypotheses: list[Hypothesis]) -> set[bytes]:
         return {h.T_target_source.tobytes() for h in hypotheses}
@@ -149,23 +181,26 @@ def test_a_filter_draws_closer_what_it_looks_at(
 
 
 @pytest.mark.parametrize("threshold", [2.0, 3.0])
-def test_a_filter_judges_the_motions_that_it_gives(threshold: float) -> None:
-    """Whether or not its surfaces, in inlier thresholds, are those that the network wants."""
+def test_what_is_scored_is_what_is_given(threshold: float) -> None:
+    """Whether or not the surfaces, in inlier thresholds, are those that the network wants."""
     rows, _ = scene(3, share=0.1)
     given = Correspondences(rows, viewpoints=AT_ZERO)
-    judge = MotionJudge(network(), estimator=EstimatorConfig(inlier_threshold=threshold))
-    looked_at = [h for h in judge(given, voxel_size=VOXEL).hypotheses if h.verdict is not None]
+    found = weigh(given, EstimatorConfig(inlier_threshold=threshold))
+    looked_at = found.hypotheses[: len(found.verdicts)]
+    judge = MotionJudge(network())
     again = judge.about(given, voxel_size=VOXEL)(np.array([h.T_target_source for h in looked_at]))
     assert len(looked_at) >= 2
-    assert [h.verdict for h in looked_at] == pytest.approx([j.verdict for j in again], abs=1e-4)
+    assert found.verdicts == pytest.approx([j.verdict for j in again], abs=1e-4)
 
 
-def test_a_filter_gives_the_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bare_correspondences_give_the_same_bytes_for_any_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     given = Correspondences(scene(3, count=600, share=0.1)[0], viewpoints=AT_ZERO)
     found = []
     for threads in ("1", "2", "5"):
         monkeypatch.setenv("OMP_NUM_THREADS", threads)
-        output = MotionJudge(network())(given, voxel_size=VOXEL)
+        output = weigh(given)
         found.append((output.weights.tobytes(), [h.T_target_source.tobytes() for h in output.hypotheses]))
     assert found[0] == found[1] == found[2]
 
@@ -199,17 +234,22 @@ def test_judging_leaves_the_threads_of_torch_as_they_were(monkeypatch: pytest.Mo
         assert (torch.get_num_threads(), seen) == (2, [2])
 
 
-def test_filter_without_any_motion_gives_no_weight() -> None:
+def test_without_any_hypothesis_there_is_no_weight() -> None:
     line = np.linspace(0, 1, 30)[:, None] * np.ones(6)
-    found = MotionJudge(network())(Correspondences(line), voxel_size=VOXEL)
-    assert found.hypotheses == ()
+    found = weigh(Correspondences(line))
+    assert found.hypotheses == []
     assert not found.weights.any()
-    assert not MotionJudge(network())(Correspondences(np.zeros((0, 6))), voxel_size=VOXEL).weights.any()
+    assert not weigh(Correspondences(np.zeros((0, 6)))).weights.any()
 
 
 def test_rows_that_are_not_finite_weigh_nothing() -> None:
-    rows, _ = scene(4)
+    rows, T = scene(4)
     rows[5, 2] = np.nan
-    found = MotionJudge(network())(Correspondences(rows), voxel_size=VOXEL)
-    assert found.hypotheses
-    assert found.weights[5] == 0
+    rows = np.vstack([np.full((1000, 6), np.nan), rows])
+    (judged,) = MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)(T[None])
+    assert judged.output.weights.shape == (len(rows),)
+    assert not judged.output.weights[:1000].any()
+    assert judged.output.weights[1005] == 0
+    assert judged.output.weights.any()
+    assert judged.output.logits is not None
+    assert np.isfinite(judged.output.logits[1006:]).all()

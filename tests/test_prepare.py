@@ -27,7 +27,8 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
-from geomoe3d.features.fpfh import describe
+from geomoe3d.features.base import with_features
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.types import PointCloud
 
 CONFIG = PreparationConfig(viewpoint="centroid")  # a guess costs time and is tested by itself
@@ -234,8 +235,8 @@ def test_moving_by_whole_voxels_moves_points_and_keeps_normals() -> None:
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_the_unit_of_length_changes_nothing_but_the_lengths(scale: float) -> None:
     points = corner(np.random.default_rng(8), noise=0.005)
-    a = describe(prepare(PointCloud(points), 0.125, CONFIG), CONFIG)
-    b = describe(prepare(PointCloud(points * scale), 0.125 * scale, CONFIG), CONFIG)
+    a = with_features(prepare(PointCloud(points), 0.125, CONFIG), FpfhDescriptor())
+    b = with_features(prepare(PointCloud(points * scale), 0.125 * scale, CONFIG), FpfhDescriptor())
     np.testing.assert_allclose(b.points, a.points * scale, rtol=1e-9, atol=1e-12 * scale)
     assert (np.abs(np.einsum("ij,ij->i", a.normals, b.normals)) > 1 - 1e-6).mean() > 0.999
     assert np.median(np.linalg.norm(a.features - b.features, axis=1)) < 1e-3

@@ -62,7 +62,7 @@ def test_sample_pair_lands_on_the_truth_and_knows_it(pair, answer):
     assert translation_error(answer.T_target_source, pair[2]) < 0.01
     assert 0.4 < answer.overlap < 0.8
     assert 0 < answer.num_inliers < answer.num_correspondences <= 2000
-    stages = ("load", "prepare", "describe", "match", "weigh", "solve", "verify", "refine", "judge", "total")
+    stages = ("load", "prepare", "features", "match", "propose", "score", "refine", "decide", "total")
     assert tuple(answer.seconds) == stages
     assert np.linalg.det(answer.T_target_source[:3, :3]) == pytest.approx(1, abs=1e-12)
 
@@ -150,11 +150,11 @@ def test_unrelated_scans_are_never_ok(pair, seed):
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (1, 2, 3)])
-@pytest.mark.parametrize(("name", "least"), [("none", 0.8), ("geomoe", 0.5)])
+@pytest.mark.parametrize(("name", "least"), [("surfaces", 0.8), ("surfaces, network", 0.5)])
 def test_symmetric_boxes_are_ambiguous_and_show_the_other_motion(size, name, least):
     """The clouds like both motions alike; the network may prefer one a little."""
     target = transform_points(MOTION, box(size, 20_000, 1))
-    result = geomoe3d.register(box(size, 20_000, 0), target, filter={"name": name})
+    result = geomoe3d.register(box(size, 20_000, 0), target, scoring={"scorers": name.split(", ")})
     assert result.status == "ambiguous"
     assert result.alternative is not None
     assert result.alternative.relative_score > least
@@ -233,7 +233,7 @@ def test_stray_points_far_away_do_not_matter(pair):
 
 @pytest.mark.parametrize(
     "assignment",
-    ["estimator.name=ransac", "filter.name=spectral", "refinement.method=icp", "matching.method=mutual"],
+    ["estimator.name=ransac", "filter.name=spectral", "refinement.name=icp", "matching.name=mutual"],
 )
 def test_other_parts_land_too(pair, assignment):
     result = Registrar(load_config(None, [assignment])).register(*pair[:2])
@@ -242,7 +242,7 @@ def test_other_parts_land_too(pair, assignment):
 
 
 def test_verification_and_refinement_can_be_switched_off(pair):
-    plain = Registrar(load_config(None, ["verification.enabled=false", "refinement.method=none"]))
+    plain = Registrar(load_config(None, ["scoring.scorers=[]", "refinement.name=none"]))
     result = plain.register(*pair[:2])
     assert rotation_error_deg(result.T_target_source, pair[2]) < 5
 
@@ -264,7 +264,9 @@ def test_many_pairs_with_one_registrar(pair, answer):
 
 def test_filter_weighs_anybodys_correspondences(pair):
     matched = Registrar().explain(*pair[:2]).correspondences
-    weights = Registrar(load_config(None, ["filter.name=spectral"])).filter(matched.points, voxel_size=0.05)
+    weights = Registrar(load_config(None, ["filter.name=spectral", "scoring.scorers=[surfaces]"])).filter(
+        matched.points, voxel_size=0.05
+    )
     true = np.linalg.norm(transform_points(pair[2], matched.source) - matched.target, axis=1) < 0.1
     assert weights.shape == (len(matched),)
     assert weights.min() >= 0
@@ -280,13 +282,12 @@ def test_progress_names_every_stage_in_order(pair):
     assert list(dict.fromkeys(stages)) == [
         "load",
         "prepare",
-        "describe",
+        "features",
         "match",
-        "weigh",
-        "solve",
-        "verify",
+        "propose",
+        "score",
         "refine",
-        "judge",
+        "decide",
     ]
 
 
@@ -308,8 +309,8 @@ def test_correspondences_are_bounded_however_many_points(pair):
 
 
 def test_a_first_guess_without_verification_is_refused_before_work(pair):
-    config = load_config(None, ["verification.enabled=false"])
-    with pytest.raises(ConfigError, match=r"verification\.enabled is false"):
+    config = load_config(None, ["scoring.scorers=[]"])
+    with pytest.raises(ConfigError, match=r"scoring\.scorers is empty"):
         geomoe3d.register(pair[0], pair[1], config=config, initial=np.eye(4))
 
 

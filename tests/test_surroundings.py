@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import EstimatorConfig, MatchingConfig
 from geomoe3d.errors import InputError
+from geomoe3d.estimators.base import Estimator
 from geomoe3d.estimators.consensus import ConsensusEstimator, compatibility, score
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.estimators.surroundings import Surroundings
@@ -232,8 +235,7 @@ def two_motions(seed: int) -> tuple[Correspondences, Surroundings, np.ndarray, n
 def test_free_space_decides_between_two_motions(seed: int) -> None:
     given, around, right, wrong = two_motions(seed)
     for near, expected in ((replace(around, views=None), wrong), (around, right)):
-        estimate = ConsensusEstimator().with_surroundings(near)
-        best = estimate(given.points, inlier_threshold=THRESHOLD)[0]
+        best = ConsensusEstimator()(given.points, inlier_threshold=THRESHOLD, surroundings=near)[0]
         assert rotation_error_deg(best.T_target_source, expected) < 2
 
 
@@ -256,9 +258,9 @@ def test_rows_of_weight_zero_are_as_if_absent() -> None:
     around = Surroundings.of(given, THRESHOLD)
     weights = (np.arange(300) % 3 > 0) * 1.0
     estimate = ConsensusEstimator()
-    some = estimate.with_surroundings(around)(given.points, weights, inlier_threshold=THRESHOLD)
+    some = estimate(given.points, weights, inlier_threshold=THRESHOLD, surroundings=around)
     rows = weights > 0
-    alone = estimate.with_surroundings(around.take(rows))(given.points[rows], inlier_threshold=THRESHOLD)
+    alone = estimate(given.points[rows], inlier_threshold=THRESHOLD, surroundings=around.take(rows))
     assert len(some) > 0
     for a, b in zip(some, alone, strict=True):
         np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
@@ -268,7 +270,7 @@ def test_more_rows_than_are_compared_keep_their_surroundings() -> None:
     given, T = rows_of(15, 1000, 100)
     weights = np.where(np.arange(1000) % 2 == 0, 1.0, 0.5)  # the heavy half takes part in proposing
     estimate = ConsensusEstimator(max_dense=500, num_seeds=200)
-    asking = estimate.with_surroundings(Surroundings.of(given, THRESHOLD))
+    asking = partial(estimate, surroundings=Surroundings.of(given, THRESHOLD))
     best = asking(given.points, weights, inlier_threshold=THRESHOLD)[0]
     assert rotation_error_deg(best.T_target_source, T) < 1
     assert best.num_inliers >= 100
@@ -278,13 +280,13 @@ def test_a_normal_that_is_no_number_spoils_nothing_else() -> None:
     given, T = rows_of(16, 300, 60)
     assert given.normals is not None
     given.normals[0][7] = np.nan
-    asking = ConsensusEstimator().with_surroundings(Surroundings.of(given, THRESHOLD))
+    asking = partial(ConsensusEstimator(), surroundings=Surroundings.of(given, THRESHOLD))
     assert rotation_error_deg(asking(given.points, inlier_threshold=THRESHOLD)[0].T_target_source, T) < 1
 
 
 def test_motions_for_training_are_proposed_with_the_sensors_at_zero(monkeypatch) -> None:
     seen = []
-    monkeypatch.setattr(motions, "propose", lambda estimate, rows, *_, **__: seen.append(rows) or [])
+    monkeypatch.setattr(motions, "propose", lambda estimate, pair, *_: seen.append(pair.matched) or [])
     points = np.random.default_rng(17).normal(size=(20, 6)).astype(np.float32)
     motions.with_motions(TrainingPair(points, np.ones(20, dtype=bool), np.eye(4), 0.05))
     np.testing.assert_array_equal(seen[0].viewpoints, np.zeros((2, 3)))
@@ -316,14 +318,8 @@ def test_bad_rows_are_named_before_anything_is_fitted_to_them(spoil, message) ->
     rows = np.random.default_rng(13).normal(size=(50, 6))
     spoil(rows)
     with pytest.raises(InputError, match=message):
-        propose(
-            ConsensusEstimator(),
-            Correspondences(rows),
-            np.ones(50),
-            EstimatorConfig(),
-            inlier_threshold=THRESHOLD,
-            seed=0,
-        )
+        pair = Pair(Correspondences(rows), THRESHOLD / 2, THRESHOLD)
+        propose(ConsensusEstimator(), pair, np.ones(50), EstimatorConfig())
 
 
 def test_proposing_hands_the_surroundings_to_the_estimator() -> None:
@@ -331,16 +327,15 @@ def test_proposing_hands_the_surroundings_to_the_estimator() -> None:
     given = replace(given, mutual=np.arange(100) < 40)
     seen = []
 
-    class Asking:
-        def with_surroundings(self, around):
-            def estimate(correspondences, weights=None, *, inlier_threshold, seed=0):
-                seen.append((np.asarray(correspondences), around))
-                return []
+    class Asking(Estimator):
+        uses_surroundings = True
 
-            return estimate
+        def __call__(self, correspondences, weights=None, *, inlier_threshold, seed=0, surroundings=None):
+            seen.append((np.asarray(correspondences), surroundings))
+            return []
 
     config = EstimatorConfig(mutual_round=True)
-    propose(Asking(), given, np.ones(100), config, inlier_threshold=THRESHOLD, seed=0)
+    propose(Asking(), Pair(given, THRESHOLD / 2, THRESHOLD), np.ones(100), config)
     assert [len(rows) for rows, _ in seen] == [100, 40]
     for rows, around in seen:
         np.testing.assert_allclose(around.points[0] * THRESHOLD, rows[:, :3], atol=1e-12)

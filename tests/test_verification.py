@@ -9,16 +9,21 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.clouds.viewpoint import find_viewpoints
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, RegistrationConfig
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision.selection import Selection, clearly_different
 from geomoe3d.errors import InputError
-from geomoe3d.features.fpfh import describe
+from geomoe3d.features.base import with_features
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
-from geomoe3d.scoring.surfaces import Evidence, Verifier, clearly_different
-from geomoe3d.types import Hypothesis, PreparedCloud
+from geomoe3d.refinement.base import NoRefiner
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.surfaces import SurfaceScorer, Verifier, evidence_of
+from geomoe3d.types import Correspondences, Hypothesis, PreparedCloud
 
 CONFIG = PreparationConfig()
 THRESHOLD = 0.1
@@ -30,7 +35,7 @@ def pair() -> tuple[PreparedCloud, PreparedCloud, np.ndarray]:
     views = find_viewpoints(source, target, "auto")
     assert views[0] is not None
     made = [
-        describe(prepare(cloud, 0.05, CONFIG, viewpoint=view), CONFIG)
+        with_features(prepare(cloud, 0.05, CONFIG, viewpoint=view), FpfhDescriptor())
         for cloud, view in zip((source, target), views, strict=True)
     ]
     return made[0], made[1], T
@@ -134,20 +139,20 @@ def test_the_true_motion_beats_random_and_neighbouring_ones(pair, verifier: Veri
     for axis in range(3):
         for step in (-1, 1):
             wrong += [turned(15 * step, axis) @ T, turned(0, 0, tuple(0.5 * step * np.eye(3)[axis])) @ T]
-    scores = [verifier.evidence(W).score for W in wrong]
-    assert truth.score > 2 * max(scores)
+    scores = [verifier.evidence(W).surface_score for W in wrong]
+    assert truth.surface_score > 2 * max(scores)
 
 
 def test_the_score_falls_as_the_motion_leaves_the_truth(pair, verifier: Verifier) -> None:
     T = pair[2]
     for axis in range(3):
-        scores = [verifier.evidence(turned(angle, axis) @ T).score for angle in (0, 2, 6, 20)]
+        scores = [verifier.evidence(turned(angle, axis) @ T).surface_score for angle in (0, 2, 6, 20)]
         assert scores == sorted(scores, reverse=True)
 
 
 def test_far_away_there_is_no_evidence(verifier: Verifier) -> None:
     far = verifier.evidence(turned(0, 0, (1000.0, 0, 0)))
-    assert (far.overlap, far.agreement, far.distinctiveness, far.score) == (0, 0, 0, 0)
+    assert (far.overlap, far.agreement, far.distinctiveness, far.surface_score) == (0, 0, 0, 0)
     assert far.free_space_violation >= 0
 
 
@@ -157,7 +162,9 @@ def test_shares_are_shares_and_the_score_is_what_the_class_says(pair, verifier: 
         assert 0 <= e.agreement <= e.overlap <= 1
         assert -e.agreement <= e.distinctiveness <= e.agreement * (np.log(257) - 1)
         assert 0 <= e.free_space_violation <= 2
-        assert e.score == pytest.approx(max(e.distinctiveness, 0) * np.exp(-10 * e.free_space_violation))
+        assert e.surface_score == pytest.approx(
+            max(e.distinctiveness, 0) * np.exp(-10 * e.free_space_violation)
+        )
 
 
 def test_evidence_equals_its_definition_written_plainly(pair) -> None:
@@ -250,17 +257,24 @@ def test_the_seed_decides_the_choice_and_matters_little(pair) -> None:
     a, b, c = (Verifier(source, target, THRESHOLD, seed=seed).evidence(T) for seed in (0, 0, 1))
     assert a == b
     assert a != c
-    assert a.score == pytest.approx(c.score, rel=0.15)
+    assert a.surface_score == pytest.approx(c.surface_score, rel=0.15)
 
 
 def test_clouds_without_features_are_refused(pair) -> None:
     source, target, _ = pair
     for a, b in ((replace(source, features=None), target), (source, replace(target, features=None))):
-        with pytest.raises(InputError, match="describe"):
+        with pytest.raises(InputError, match="with_features"):
             Verifier(a, b, THRESHOLD)
 
 
 # ---- ranking --------------------------------------------------------------------------------------------
+
+
+def selection(pair) -> Selection:
+    source, target = pair[:2]
+    seen = Pair(Correspondences(np.zeros((0, 6))), source.voxel_size, THRESHOLD, 0, source, target)
+    scorers = {"surfaces": SurfaceScorer()}
+    return Selection(seen, scorers, NoRefiner(), RegistrationConfig(), StageClock())
 
 
 def test_ranking_puts_the_truth_first_and_keeps_every_hypothesis(pair, verifier: Verifier) -> None:
@@ -273,17 +287,20 @@ def test_ranking_puts_the_truth_first_and_keeps_every_hypothesis(pair, verifier:
         turned(5, 0) @ T,
     ]
     hypotheses = [Hypothesis(motion, float(k), k) for k, motion in enumerate(motions)]
-    ranked = verifier.rank(hypotheses)
-    assert ranked[0][0] is hypotheses[2]
-    assert {id(h) for h, _ in ranked} == {id(h) for h in hypotheses}
-    scores = [e.score for _, e in ranked]
+    chosen = selection(pair)
+    chosen.add(hypotheses)
+    ranked = chosen.hypotheses
+    assert ranked[0] is hypotheses[2]
+    assert {id(h) for h in ranked} == {id(h) for h in hypotheses}
+    scores = [h.score for h in ranked]
     assert scores == sorted(scores, reverse=True)
-    for h, e in ranked:
-        assert e == verifier.evidence(h.T_target_source)
-    nowhere = [h for h, e in ranked if e.distinctiveness == 0 and e.overlap == 0]
+    for h in ranked:
+        assert evidence_of(h) == verifier.evidence(h.T_target_source)
+        assert h.score == evidence_of(h).surface_score
+    nowhere = [h for h in ranked if evidence_of(h).distinctiveness == 0 and evidence_of(h).overlap == 0]
     # Equal evidence keeps the given order.
     assert [h.num_inliers for h in nowhere] == [1, 3]
-    assert verifier.rank([]) == []
+    assert verifier(np.zeros((0, 4, 4))) == []
 
 
 def test_another_motion_is_one_that_shifts_or_turns_clearly(pair) -> None:
@@ -295,23 +312,21 @@ def test_another_motion_is_one_that_shifts_or_turns_clearly(pair) -> None:
         R[:3, 3] = centre - R[:3, :3] @ centre + [shift, 0, 0]
         return Hypothesis(R @ T, 0.0, 0)
 
-    nothing = Evidence(0, 0, 0, 0)
     same = [around_centre(0), around_centre(14.9), around_centre(0, 0.29), around_centre(14, 0.28)]
-    assert clearly_different([(h, nothing) for h in same], T, source, 0.3) is None
+    assert clearly_different(same, T, source, 0.3) is None
     assert clearly_different([], T, source, 0.3) is None
     for other in (around_centre(15.1), around_centre(0, 0.31), around_centre(180)):
         later = around_centre(90)
-        ranked = [(h, nothing) for h in (*same, other, later)]
-        assert clearly_different(ranked, T, source, 0.3)[0] is other
+        assert clearly_different([*same, other, later], T, source, 0.3) is other
 
 
 def test_hypotheses_asked_together_get_what_each_gets_alone(pair, verifier: Verifier) -> None:
     T = pair[2]
     motions = [T, *(turned(30 * k, k % 3, (0.1 * k, 0, 0)) @ T for k in range(1, 13))]
     motions.insert(7, turned(0, 0, (100, 0, 0)) @ T)  # where nothing meets
-    ranked = verifier.rank([Hypothesis(motion, 0.0, 0) for motion in motions])
-    assert len(ranked) == len(motions)
-    for hypothesis, evidence in ranked:
-        alone = verifier.evidence(hypothesis.T_target_source)
+    found = verifier(np.array(motions))
+    assert len(found) == len(motions)
+    for transform, evidence in zip(motions, found, strict=True):
+        alone = verifier.evidence(transform)
         assert astuple(evidence)[:4] == pytest.approx(astuple(alone)[:4], rel=1e-12, abs=1e-12)
-    assert ranked[0][0].T_target_source is T
+    assert max(found, key=lambda evidence: evidence.surface_score) is found[0]

@@ -17,7 +17,7 @@ def test_svd_is_exact_without_outliers_and_with_weights_that_remove_them() -> No
         SVD(rows, true.astype(float), inlier_threshold=THRESHOLD),
     ):
         assert_motion(found[0].T_target_source, T, degrees=1e-9, length=1e-10)
-        assert found[0].score == pytest.approx(true.sum(), rel=1e-9)
+        assert found[0].proposal_score == pytest.approx(true.sum(), rel=1e-9)
 
 
 def test_svd_equals_scipy_on_noisy_weighted_rows() -> None:

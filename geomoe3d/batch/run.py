@@ -24,7 +24,7 @@ from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.features.cache import CACHE_VARIABLE
-from geomoe3d.filters.base import resolved
+from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 ALL_THAT_FIT = 0

@@ -9,7 +9,6 @@ same for spreadsheets.
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
 import os
@@ -36,7 +35,7 @@ from geomoe3d.batch.table import MATRIX_COLUMNS
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import FormatError, InputError, OutputError
-from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, find_weights
+from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
@@ -96,7 +95,7 @@ class BatchStore:
             "versions": library_versions(),
             "seed": config.seed,
         }
-        self._identity = {"format": FORMAT, **self._shared, "weights": _weights_hash(config)}
+        self._identity = {"format": FORMAT, **self._shared, "pipeline": Pipeline(resolved(config)).identity()}
         there = check_can_be_folder(folder, "results are written into a folder")
         if not os.access(there, os.W_OK | os.X_OK):
             raise OutputError(f"cannot write into '{folder}': no right to write into '{there}'")
@@ -212,11 +211,3 @@ def results_table(records: Iterable[dict[str, Any]]) -> str:
         cells = ["" if value is None else repr(value) for value in numbers]
         writer.writerow([record["id"], result["status"], *cells, "; ".join(result["reasons"])])
     return out.getvalue()
-
-
-def _weights_hash(config: RegistrationConfig) -> str | None:
-    """Hash of the filter's weights, if it has any: another training must not mix with the old."""
-    if config.filter.name != "geomoe":
-        return None
-    path = find_weights(config.filter.weights or DEFAULT_WEIGHTS)
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

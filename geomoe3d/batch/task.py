@@ -16,7 +16,7 @@ from geomoe3d.batch.table import PairRow
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import DependencyError, GeoMoE3DError, OutputError
-from geomoe3d.features.cache import DescriptionCache, default_cache_folder
+from geomoe3d.features.cache import FeatureCache, default_cache_folder
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
 
@@ -109,12 +109,12 @@ def _registrar(settings: Settings) -> Registrar:
     return Registrar(config, cache=open_cache(settings.cache))
 
 
-def open_cache(folder: str | None) -> DescriptionCache | None:
+def open_cache(folder: str | None) -> FeatureCache | None:
     """The cache in a folder; None: the user's own; empty, or a folder that cannot be made: none."""
     if folder == "":
         return None
     try:
-        return DescriptionCache(folder or default_cache_folder())
+        return FeatureCache(folder or default_cache_folder())
     except OutputError as error:
         warnings.warn(f"features are not cached: {error}", RuntimeWarning, stacklevel=2)
         return None

@@ -6,14 +6,15 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.parts import part_options
 
 if TYPE_CHECKING:
-    from geomoe3d.registration import Explanation
+    from geomoe3d.decision.explanation import Explanation
     from geomoe3d.result import RegistrationResult
 
 
@@ -35,9 +36,9 @@ class _Outputs:
 @click.option("--seed", metavar="N", help="Same seed, same answer. [0]")
 @click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
-@click.option("--filter", "filter_name", metavar="NAME", help="What weighs the correspondences. [auto]")
-@click.option("--weights", metavar="FILE", help="Trained weights of the filter geomoe (.safetensors).")
-@click.option("--estimator", metavar="NAME", help="consensus, ransac or svd. [consensus]")
+@part_options
+@click.option("--weights", metavar="FILE", help="Trained network (.safetensors): scorer or filter, as it is.")
+@click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
 @click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
@@ -70,9 +71,9 @@ def command(
     seed: str | None,
     config_file: str | None,
     assignments: tuple[str, ...],
-    filter_name: str | None,
+    parts: list[str],
     weights: str | None,
-    estimator: str | None,
+    correspondences: str | None,
     initial: str | None,
     inverse: bool,
     as_json: bool,
@@ -93,15 +94,9 @@ def command(
     """
     from geomoe3d.config import load_config
 
-    named = {
-        "voxel_size": voxel_size,
-        "seed": seed,
-        "filter.name": filter_name,
-        "filter.weights": weights,
-        "estimator.name": estimator,
-    }
+    named = {"voxel_size": voxel_size, "seed": seed}
     given = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(config_file, [*assignments, *given])
+    config = load_config(config_file, [*assignments, *given, *parts])
     outputs = _Outputs(output, aligned, aligned_precision, picture, page)
     _check_outputs(outputs, (source, target), force)
     if show:
@@ -113,17 +108,21 @@ def command(
 
     with stdout_to_stderr(), stage_display(quiet) as stage:
         stage("start")  # importing the libraries below takes a second
+        from geomoe3d.clouds.correspondence_files import load_correspondences
         from geomoe3d.clouds.transform_files import load_transform
+        from geomoe3d.pipeline import with_weights
         from geomoe3d.registration import Registrar
 
         guess = None if initial is None else load_transform(initial)
-        registrar = Registrar(config)
+        matches = None if correspondences is None else load_correspondences(correspondences)
+        registrar = Registrar(config if weights is None else with_weights(config, weights))
+        told: dict[str, Any] = {"initial": guess, "correspondences": matches, "progress": stage}
         explanation: Explanation | None = None
         if picture is not None or page is not None or show:
-            explanation = registrar.explain(source, target, initial=guess, progress=stage)
+            explanation = registrar.explain(source, target, **told)
             result = explanation.result
         else:
-            result = registrar.register(source, target, initial=guess, progress=stage)
+            result = registrar.register(source, target, **told)
     try:
         with stdout_to_stderr(), stage_display(quiet) as stage:
             _write(outputs, result, explanation, source, inverse, force, stage)

@@ -22,7 +22,8 @@ from geomoe3d.data.fusion import measure_overlap
 from geomoe3d.data.shards import DescribedScene, is_shard, open_shard, why_stale, write_shard
 from geomoe3d.data.splits import split_of
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
-from geomoe3d.features.fpfh import describe
+from geomoe3d.features.base import with_features
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.types import Float32Array, PointCloud
 
@@ -57,7 +58,7 @@ def describe_fragment(cloud: PointCloud, voxel_size: float = VOXEL_SIZE) -> tupl
         EmptyCloudError: fewer than 3 voxels.
     """
     config = PreparationConfig()
-    prepared = describe(prepare(cloud, voxel_size, config, viewpoint=-cloud.origin), config)
+    prepared = with_features(prepare(cloud, voxel_size, config, viewpoint=-cloud.origin), FpfhDescriptor())
     assert prepared.features is not None
     return (prepared.points + cloud.origin).astype(np.float32), prepared.features
 

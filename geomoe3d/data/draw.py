@@ -232,7 +232,7 @@ def draw_pair(
 
 
 _EVERY = 1 << 30
-_MATCHING = MatchingConfig(method="one_way", neighbors=1, max_correspondences=1_000_000)
+_MATCHING = MatchingConfig(name="one_way", neighbors=1, max_correspondences=1_000_000)
 
 
 def _cloud(points: Any, features: Any, voxel_size: float) -> PreparedCloud:

@@ -1,4 +1,4 @@
-"""From findings in local frames to the result a user holds: file coordinates, counts and provenance."""
+"""From a decision in local frames to the result a user holds: file coordinates, counts and provenance."""
 
 from __future__ import annotations
 
@@ -8,84 +8,90 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.confidence import Information, Judgement
-from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames
 from geomoe3d.result import Alternative, CloudReport, RegistrationResult
-from geomoe3d.scoring.surfaces import Evidence
+from geomoe3d.scoring.network import opinion_of
+from geomoe3d.scoring.surfaces import Evidence, evidence_of
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 _DECIDING_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "open3d", "small_gicp", "trimesh", "torch")
 
 
 @dataclass(frozen=True)
-class Findings:
-    """What solving, verifying, refining and judging found, in local frames.
+class Decision:
+    """What was decided about a pair, in local frames.
 
     Attributes:
-        T_target_source: (4, 4) the answer, or NaN where there was no hypothesis.
-        alternative: the best clearly different motion, or None.
-        lead: score of the answer over that of the alternative, see `judge.lead_over`.
-        evidence, information, judgement: see their classes; evidence None where there was no hypothesis.
-        weighed: what a network said of the correspondences under the answer, or None without one.
+        answer: the best hypothesis, refined; None where there was none.
+        alternative: the best clearly different one, or None.
+        lead: score of the answer over that of the alternative, see `lead_over`.
+        information, judgement: see their classes.
+        hypotheses: all that were considered, best first, before refinement.
     """
 
-    T_target_source: FloatArray
+    answer: Hypothesis | None
     alternative: Hypothesis | None
     lead: float
-    evidence: Evidence | None
     information: Information
     judgement: Judgement
-    weighed: FilterOutput | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
 
     @classmethod
-    def nothing(cls, reason: str) -> Findings:
+    def failed(cls, reason: str) -> Decision:
         """No hypothesis at all."""
         nothing = Information(np.full((6, 6), np.nan), np.full(3, np.nan), 0.0, 0)
-        return cls(np.full((4, 4), np.nan), None, np.inf, None, nothing, Judgement("failed", (reason,), 0.0))
+        return cls(None, None, np.inf, nothing, Judgement("failed", (reason,), 0.0))
 
-    def motions(self) -> list[Hypothesis]:
-        """The answer and the alternative, as far as there are any."""
-        answer = [] if self.evidence is None else [Hypothesis(self.T_target_source, 0.0, 0)]
-        return answer if self.alternative is None else [*answer, replace(self.alternative, verdict=None)]
+    @property
+    def T_target_source(self) -> FloatArray:
+        """(4, 4) of the answer, or NaN."""
+        return np.full((4, 4), np.nan) if self.answer is None else self.answer.T_target_source
 
-    def with_note(self, note: str) -> Findings:
-        """The same findings with one more sentence among the reasons."""
+    @property
+    def evidence(self) -> Evidence | None:
+        """What the clouds say of the answer, or None."""
+        return None if self.answer is None else evidence_of(self.answer)
+
+    def transforms(self) -> list[Hypothesis]:
+        """The answer and the alternative, as far as there are any, to be scored by others."""
+        both = (h for h in (self.answer, self.alternative) if h is not None)
+        return [Hypothesis(h.T_target_source, h.proposal_score, h.num_inliers) for h in both]
+
+    def with_note(self, note: str) -> Decision:
+        """The same decision with one more sentence among the reasons."""
         return replace(self, judgement=replace(self.judgement, reasons=(*self.judgement.reasons, note)))
 
     def residuals(self, matched: Correspondences) -> FloatArray:
         """|R p + t - q| of every correspondence (N,); infinite without a transform."""
-        if self.evidence is None:
+        if self.answer is None:
             return np.full(len(matched), np.inf)
         return residuals(self.T_target_source, matched.source, matched.target)
 
 
 def finished_result(
-    prepared: tuple[PreparedCloud, PreparedCloud],
-    matched: Correspondences,
-    findings: Findings,
-    config: RegistrationConfig,
-    threshold: float,
-    seconds: dict[str, float],
+    pair: Pair, decision: Decision, config: RegistrationConfig, seconds: dict[str, float]
 ) -> RegistrationResult:
     """The result of a pair that went through the whole pipeline; see `RegistrationResult`."""
-    source, target = prepared
-    T = shift_frames(findings.T_target_source, source.origin, target.origin)
+    source, target = pair.clouds
+    matched, threshold = pair.matched, pair.inlier_threshold
+    T = shift_frames(decision.T_target_source, source.origin, target.origin)
     return RegistrationResult(
         T_target_source=T,
-        status=findings.judgement.status,
-        reasons=findings.judgement.reasons,
-        confidence=findings.judgement.confidence,
-        overlap=findings.evidence.overlap if findings.evidence else 0.0,
-        evidence=_evidence(findings.evidence, findings.information) if findings.evidence else {},
+        status=decision.judgement.status,
+        reasons=decision.judgement.reasons,
+        confidence=decision.judgement.confidence,
+        overlap=decision.evidence.overlap if decision.evidence else 0.0,
+        evidence=_evidence(decision),
         num_correspondences=len(matched),
-        num_inliers=int((findings.residuals(matched) < threshold).sum()),
+        num_inliers=int((decision.residuals(matched) < threshold).sum()),
         inlier_threshold=threshold,
         voxel_size=source.voxel_size,
-        alternative=_alternative(findings, source, target),
-        information_matrix=findings.information.matrix,
-        information_center=findings.information.center + target.origin,
+        alternative=_alternative(decision, source, target),
+        information_matrix=decision.information.matrix,
+        information_center=decision.information.center + target.origin,
         source=_report(source),
         target=_report(target),
         seconds=seconds,
@@ -154,26 +160,29 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
     return tuple(versions.items())
 
 
-def _evidence(evidence: Evidence, information: Information) -> dict[str, float]:
-    """Their numbers by name; without a network there is no verdict."""
-    values = {name: value for name, value in asdict(evidence).items() if value is not None}
+def _evidence(decision: Decision) -> dict[str, float]:
+    """Numbers of the answer by name; without a network there is no verdict."""
+    evidence, opinion = decision.evidence, opinion_of(decision.answer)
+    if evidence is None or decision.answer is None:
+        return {}
     return {
-        **values,
+        **asdict(evidence),
+        **({} if opinion is None else {"verdict": opinion.verdict}),
         "surface_score": evidence.surface_score,
-        "score": evidence.score,
-        "observability": information.observability,
-        "looseness": information.looseness,
+        "score": decision.answer.score,
+        "observability": decision.information.observability,
+        "looseness": decision.information.looseness,
     }
 
 
-def _alternative(findings: Findings, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:
-    if findings.alternative is None:
+def _alternative(decision: Decision, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:
+    if decision.alternative is None:
         return None
-    T = findings.alternative.T_target_source
-    shift, turn = motions_apart(findings.T_target_source, T, source.points.mean(0))
+    T = decision.alternative.T_target_source
+    shift, turn = motions_apart(decision.T_target_source, T, source.points.mean(0))
     return Alternative(
         T_target_source=shift_frames(T, source.origin, target.origin),
-        relative_score=1 / findings.lead if findings.lead > 0 else 1.0,
+        relative_score=1 / decision.lead if decision.lead > 0 else 1.0,
         rotation_difference_deg=turn,
         translation_difference=shift,
     )

@@ -1,6 +1,6 @@
 """How sure: status, reasons and confidence from the evidence, and the information of the fit.
 
-Place: judge, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
+Place: decide, the last step. The confidence is P(the answer is right), a logistic function of the evidence of
 the clouds, its lead over the best clearly different motion, the overlap, how firmly the shared surface holds
 the source and its sensor, and the share of correspondences that agree.
 """
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomoe3d.config import JudgementConfig
+from geomoe3d.config import DecisionConfig
 from geomoe3d.geometry.se3 import cross_matrix, transform_points
 from geomoe3d.result import Status
-from geomoe3d.scoring.surfaces import Evidence
-from geomoe3d.types import FloatArray, PreparedCloud
+from geomoe3d.scoring.network import opinion_of
+from geomoe3d.scoring.surfaces import Evidence, evidence_of
+from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
 # Fitted by scripts/fit_confidence.py on generated rooms that the network was not trained on and a recorded
 # one, mixed by overlap as the benchmarks are, and on unrelated pairs: 300 and 150 pairs, each with one look
@@ -132,28 +133,29 @@ def deviations_at(matrix: FloatArray, center: FloatArray, points: FloatArray) ->
 
 
 def judge(
-    evidence: Evidence,
+    answer: Hypothesis,
+    rival: Hypothesis | None,
     lead: float,
     support: float,
     information: Information,
-    config: JudgementConfig,
-    rival: Evidence | None = None,
+    config: DecisionConfig,
 ) -> Judgement:
     """Decide whether an answer may be believed.
 
     Args:
-        evidence: of the answer, after refinement.
+        answer: scored, after refinement.
+        rival: the best clearly different hypothesis, if there is one.
         lead: as `lead_over` gives it.
         support: share of the correspondences that agree with the answer.
         information: of the answer.
         config: thresholds.
-        rival: of the best clearly different motion, if there is one.
 
     Returns:
         ``ambiguous`` where the surfaces let the source slide, or where the answer would be likely but another
         motion is about as good; ``low_confidence`` below the threshold; else ``ok``.
     """
-    confidence = confidence_score(evidence, lead, support, information)
+    evidence, heard = evidence_of(answer), opinion_of(answer) is not None
+    confidence = confidence_score(evidence, lead, support, information, heard=heard)
     notes = []
     if evidence.overlap < _LOW_OVERLAP:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -170,11 +172,11 @@ def judge(
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
-    alone = confidence_score(evidence.by_clouds(), UNRIVALLED_LEAD, support, information)
-    close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(evidence, rival, config.ambiguity_ratio)
+    alone = confidence_score(evidence, UNRIVALLED_LEAD, support, information)
+    close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(answer, rival, config.ambiguity_ratio)
     if close and alone >= _LIKELY:
         notes.append(
-            f"a clearly different motion does {min(100 / lead, 100):.0f} % as well; see the alternative, "
+            f"a clearly different transform does {min(100 / lead, 100):.0f} % as well; see the alternative, "
             "the scans may show repeated or symmetric structure"
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.5))
@@ -187,25 +189,26 @@ def judge(
     return Judgement("ok", tuple(notes), confidence)
 
 
-def _hardly_told_apart(evidence: Evidence, rival: Evidence | None, ratio: float) -> bool:
+def _hardly_told_apart(answer: Hypothesis, rival: Hypothesis | None, ratio: float) -> bool:
     """Whether the clouds like both about as well and the network's verdicts lie close together."""
-    if rival is None or evidence.verdict is None or rival.verdict is None:
+    said, other = opinion_of(answer), opinion_of(rival)
+    if rival is None or said is None or other is None:
         return False
-    alike = rival.surface_score >= ratio * evidence.surface_score
-    return alike and abs(evidence.verdict - rival.verdict) < _CLOSE_VERDICTS
+    alike = evidence_of(rival).surface_score >= ratio * evidence_of(answer).surface_score
+    return alike and abs(said.verdict - other.verdict) < _CLOSE_VERDICTS
 
 
-def lead_over(evidence: Evidence, other: Evidence | None) -> float:
-    """Score of the answer over that of the best clearly different motion.
+def lead_over(score: float, other: float | None) -> float:
+    """Score of the answer over that of the best clearly different hypothesis.
 
-    inf where the other scores nothing; 3 where no different motion was proposed at all, since an answer
-    without a rival has not beaten one; 1 where neither scores.
+    inf where the other scores nothing; 3 where no different one was proposed at all (None), since an answer
+    without a rival has not beaten one; 1 where the answer scores nothing.
     """
-    if evidence.score <= 0:
+    if score <= 0:
         return 1.0
     if other is None:
         return UNRIVALLED_LEAD
-    return evidence.score / other.score if other.score > 0 else float("inf")
+    return score / other if other > 0 else float("inf")
 
 
 CONFIDENCE_INPUTS = (
@@ -246,10 +249,15 @@ def confidence_inputs(
     )
 
 
-def confidence_score(evidence: Evidence, lead: float, support: float, information: Information) -> float:
-    """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence."""
-    if evidence.score <= 0:
+def confidence_score(
+    evidence: Evidence, lead: float, support: float, information: Information, *, heard: bool = False
+) -> float:
+    """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence.
+
+    ``heard``: whether a network was asked about the answer; see `judge` for the other arguments.
+    """
+    if evidence.surface_score <= 0:
         return 0.0
-    offset, slopes = _COEFFICIENTS[evidence.verdict is not None, information.sensors_known]
+    offset, slopes = _COEFFICIENTS[heard, information.sensors_known]
     strength = offset + confidence_inputs(evidence, lead, support, information) @ slopes
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

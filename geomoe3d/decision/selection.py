@@ -1,238 +1,269 @@
-"""From hypotheses to findings about one pair of described clouds: verify, refine, judge.
+"""From hypotheses to a decision about one pair: score, refine, decide.
 
-Hypotheses may come in several lots, from any estimator or grid; all are measured against the same clouds,
-so the choice among them does not depend on where they came from.
+Hypotheses may come in several lots, from any estimator or grid; all are scored on the same clouds, so the choice
+among them does not depend on where they came from. Everything that becomes known of a hypothesis stands in the
+hypothesis itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.decision.answer import Findings
+from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import judge, lead_over, measure_information
-from geomoe3d.geometry.se3 import (
-    check_motion,
-    motions_apart,
-    residuals,
-    shift_frames,
-)
-from geomoe3d.refinement.icp import Refiner
+from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
+from geomoe3d.refinement.base import Refiner
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.scoring.surfaces import (
-    Evidence,
-    Verifier,
-    are_different,
-    best_first,
-    clearly_different,
-    distinct,
-)
-from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PreparedCloud
-
-if TYPE_CHECKING:
-    from geomoe3d.filters.motion_judge import Judged
+from geomoe3d.scoring.base import PairScorer, Scorer
+from geomoe3d.scoring.surfaces import SURFACES, SurfaceScorer, evidence_of
+from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
 _CLOSE_LEAD = 2.0
 _KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
-_UNSEEN_VERDICT = -3.0
-_MOST_ROUNDS = 6  # further hypotheses shown one by one, where the network rejects those that the clouds like
-_DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two motions are different
+_MOST_ROUNDS = 6  # further hypotheses shown one by one, where a scorer rejects those that the clouds like
+_DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two transforms are different
+_MOST_TURN_DEG = 15.0
 
 
-class Refined(NamedTuple):
-    """A motion (4, 4) in local coordinates, its evidence, and what went wrong if anything.
-
-    ``judged`` is what the network said under it; None where it was not asked.
-    """
-
-    T_target_source: FloatArray
-    evidence: Evidence
-    note: str | None
-    judged: Judged | None
-
-
-class Chooser:
-    """Chooses among hypotheses by what the clouds say; build once per pair.
+class Selection:
+    """Selects among the hypotheses of one pair; build once per pair.
 
     Args:
-        described: source and target on one grid, with features.
-        matched: correspondences on this grid, of which a right answer has its share.
-        threshold: largest distance of points on the same surface, cloud units.
+        pair: clouds with features on one grid, and the correspondences of which a right answer has its share.
+        scorers: by name, in the order in which they are asked. Without any the first hypothesis that was added
+            is the answer, and the clouds only say how sure it is.
+        refiner: polishes the best hypotheses.
         config: of the registration.
-        clock: told of the stages weigh, verify, refine and judge.
-        network: what a learned judge says of motions (K, 4, 4), one each, or None without one.
+        clock: told of the stages score, refine and decide.
     """
 
     def __init__(
         self,
-        described: tuple[PreparedCloud, PreparedCloud],
-        matched: Correspondences,
-        threshold: float,
+        pair: Pair,
+        scorers: Mapping[str, Scorer],
+        refiner: Refiner,
         config: RegistrationConfig,
         clock: StageClock,
-        network: Callable[[FloatArray], list[Judged]] | None = None,
     ) -> None:
-        self._described, self._matched, self._threshold = described, matched, threshold
-        self._config, self._clock, self._network = config, clock, network
-        clock("verify")
-        self._verifier = Verifier(*described, threshold, seed=config.seed)
-        self._refiner = Refiner(*described, config.refinement)
-        self._ranked: list[tuple[Hypothesis, Evidence]] = []
+        clock("score")
+        self._pair, self._scorers, self._config, self._clock = pair, scorers, config, clock
+        self._source = pair.clouds[0]
+        surfaces = scorers.get(SURFACES, SurfaceScorer())
+        self._bound: dict[str, PairScorer] = {SURFACES: surfaces.about(pair)}
+        self._refiner = refiner.about(pair)
         self._first: Hypothesis | None = None
         self._guess: FloatArray | None = None
-        self._refined: dict[bytes, Refined] = {}
-        self._judged: dict[bytes, Judged] = {}
+        self.hypotheses: list[Hypothesis] = []
+        """All of them, best first."""
 
-    def consider(self, hypotheses: list[Hypothesis]) -> None:
-        """Add a lot of hypotheses, the estimator's best one first."""
-        self._clock("verify")
+    def add(self, hypotheses: Sequence[Hypothesis]) -> None:
+        """Add a lot of hypotheses, the estimator's best one first, and score them."""
+        self._clock("score")
         if self._first is None and hypotheses:
             self._first = hypotheses[0]
-        self._ranked = best_first(self._ranked + self._verifier.rank(hypotheses))
+        for name in (SURFACES, *(n for n, s in self._scorers.items() if not s.selective and n != SURFACES)):
+            self._ask(name, hypotheses)
+        self.hypotheses += hypotheses
+        self._rank()
 
-    def consider_guess(self, initial: ArrayLike) -> None:
-        """Add a user's first guess (4, 4), file coordinates, and its refinement: verified, not trusted."""
-        source, target = self._described
+    def add_guess(self, initial: ArrayLike) -> None:
+        """Add a user's first guess (4, 4), file coordinates, and its refinement: scored, not trusted."""
+        source, target = self._pair.clouds
         T = shift_frames(check_motion(initial), -source.origin, -target.origin)
-        refined, _ = self._refiner(T)
-        self._guess = refined
-        self.consider([Hypothesis(motion, 0.0, 0) for motion in (T, refined)])
+        given = Hypothesis(T)
+        refined, _ = self._refiner(given)
+        self._guess = T if refined is None else refined
+        self.add([given, Hypothesis(self._guess)])
 
-    def conclude(self, num_refined: int = 1, num_judged: int = 3) -> Findings:
+    def decide(self, num_refined: int = 1, num_shown: int = 3) -> Decision:
         """The best of all hypotheses so far, and how sure.
 
         Args:
             num_refined: so many of the best distinct hypotheses are refined before the choice.
-            num_judged: so many that the clouds like best are shown to the network, if there is one.
+            num_shown: so many that the clouds like best are shown to scorers that are selective.
         """
-        if self._network is not None and self._config.verification.enabled:
-            self._clock("weigh")
-            self._ask(self._network, num_judged)
+        selective = [name for name, scorer in self._scorers.items() if scorer.selective]
+        if selective:
+            self._clock("score")
+            for name in selective:
+                self._show_best(name, num_shown)
         self._clock("refine")
-        answer = self._answer(num_refined)
-        self._clock("judge")
+        answer = self._answer(selective, num_refined)
         if answer is None:
-            return Findings.nothing("no motion brings three correspondences in general position together")
-        T, (source, target) = answer.T_target_source, self._described
-        other, lead, rival = self._rival(answer)
-        information = measure_information(T, source, target, self._threshold)
-        support = self._support(T)
-        judgement = judge(answer.evidence, lead, support, information, self._config.judgement, rival)
-        weighed = None if answer.judged is None else answer.judged.output
-        findings = Findings(T, other, lead, answer.evidence, information, judgement, weighed)
-        for note in (answer.note, self._overruled(T)):
-            findings = findings if note is None else findings.with_note(note)
-        return findings
+            self._clock("decide")
+            return Decision.failed("no rigid transform aligns three non-collinear correspondences")
+        rival, lead = self._rival(answer)
+        self._clock("decide")
+        information = measure_information(
+            answer.T_target_source, *self._pair.clouds, self._pair.inlier_threshold
+        )
+        judgement = judge(answer, rival, lead, self._support(answer), information, self._config.decision)
+        decision = Decision(answer, rival, lead, information, judgement, tuple(self.hypotheses))
+        for note in (answer.note, self._overruled(answer)):
+            decision = decision if note is None else decision.with_note(note)
+        return decision
 
-    def _overruled(self, T_target_source: FloatArray) -> str | None:
-        """A sentence where the answer is clearly another motion than the user's first guess, refined."""
-        if self._guess is None:
-            return None
-        guess, source = self._guess, self._described[0]
-        if not are_different(T_target_source, guess, source, self._shift):
-            return None
-        shift, turn = motions_apart(T_target_source, guess, source.points.mean(0))
-        return f"the first guess is not the answer: refined, it lies {turn:.1f} deg and {shift:.3g} away"
-
-    def _ask(self, network: Callable[[FloatArray], list[Judged]], count: int) -> None:
-        """Show the network the distinct hypotheses that the clouds like best, and whatever leads after that.
-
-        A hypothesis that it was not shown ranks as if its verdict were as bad as the worst shown, or -3.
-        """
-        if not self._ranked:
-            return
-        by_clouds = sorted(self._ranked, key=lambda pair: -pair[1].surface_score)
-        shown = distinct(by_clouds, self._described[0], self._shift, count)
-        for _ in range(_MOST_ROUNDS):
-            if not self._show(network, [h for h in shown if h.verdict is None]):
-                return
-            if self._ranked[0][0].verdict is not None:
-                return
-            shown = [self._ranked[0][0]]
-
-    def _show(self, network: Callable[[FloatArray], list[Judged]], shown: list[Hypothesis]) -> bool:
-        """Get verdicts and rank anew; False where the network says nothing of these correspondences."""
-        judged = network(np.array([h.T_target_source for h in shown])) if shown else []
-        if len(judged) < len(shown):
+    def _ask(self, name: str, hypotheses: Sequence[Hypothesis]) -> bool:
+        """Have a scorer's word written into hypotheses; False where it says nothing of this pair."""
+        if not hypotheses:
+            return True
+        if name not in self._bound:  # not before it is needed
+            self._bound[name] = self._scorers[name].about(self._pair)
+        said = self._bound[name](np.array([h.T_target_source for h in hypotheses]))
+        if len(said) < len(hypotheses):
             return False
-        said = {id(h): found for h, found in zip(shown, judged, strict=True)}
-        self._judged.update((h.T_target_source.tobytes(), said[id(h)]) for h in shown)
-        known = [h.verdict for h, _ in self._ranked if h.verdict is not None]
-        unseen = min([_UNSEEN_VERDICT, *known, *(found.verdict for found in judged)])
-        ranked = []
-        for hypothesis, evidence in self._ranked:
-            found = said.get(id(hypothesis))
-            if found is not None:
-                hypothesis = replace(hypothesis, verdict=found.verdict)
-            verdict = unseen if hypothesis.verdict is None else hypothesis.verdict
-            ranked.append((hypothesis, replace(evidence, verdict=verdict)))
-        self._ranked = best_first(ranked)
+        for hypothesis, score in zip(hypotheses, said, strict=True):
+            hypothesis.scores[name] = score
+            hypothesis.asked.add(name)
         return True
 
-    def _answer(self, num_refined: int) -> Refined | None:
-        """The motion that the clouds, or without verification the correspondences, like best, refined."""
+    def _show_best(self, name: str, count: int) -> None:
+        """Ask a selective scorer about the distinct hypotheses that the clouds like best, and then about whatever
+        leads; what stands for its word on the others is its own affair (`Scorer.unasked`)."""
+        if not self.hypotheses:
+            return
+        by_clouds = sorted(self.hypotheses, key=lambda h: -evidence_of(h).surface_score)
+        shown = distinct(by_clouds, self._source, self._shift, count)
+        for _ in range(_MOST_ROUNDS):
+            if not self._ask(name, [h for h in shown if name not in h.asked]):
+                return
+            known = [h.scores[name] for h in self.hypotheses if name in h.asked]
+            for hypothesis in self.hypotheses:
+                if name not in hypothesis.asked:
+                    hypothesis.scores[name] = self._scorers[name].unasked(known)
+            self._rank()
+            if name in self.hypotheses[0].asked:
+                return
+            shown = self.hypotheses[:1]
+
+    def _rank(self) -> None:
+        """Best first; equal ones keep their order."""
+        self.hypotheses.sort(key=lambda h: (-h.score, -evidence_of(h).distinctiveness))
+
+    def _answer(self, selective: list[str], num_refined: int) -> Hypothesis | None:
+        """What the scorers, or without any the estimator, like best, refined."""
         if self._first is None:
             return None
-        if not self._config.verification.enabled:
-            return self._refine(self._first, None)
-        judged = [(h, evidence) for h, evidence in self._ranked if h.verdict is not None]
-        best = distinct(judged or self._ranked, self._described[0], self._shift, num_refined)
-        return max((self._refine(h, h.verdict) for h in best), key=lambda found: found.evidence.score)
+        if not self._scorers:
+            return self._refine(self._first)
+        asked = [h for h in self.hypotheses if all(name in h.asked for name in selective)]
+        best = distinct(asked or self.hypotheses, self._source, self._shift, num_refined)
+        return max((self._refine(h) for h in best), key=lambda refined: refined.score)
 
-    def _refine(self, hypothesis: Hypothesis, verdict: float | None) -> Refined:
-        """The motion refined on the clouds, or as it was where that made them fit less well.
+    def _refine(self, hypothesis: Hypothesis) -> Hypothesis:
+        """The hypothesis refined and scored, or as it was where that made the clouds fit less well.
 
-        What the network has judged it judges again after refinement; else ``verdict`` holds, a guess.
+        A scorer that was asked about it is asked about the refined one; else what was assumed holds.
         """
-        key = hypothesis.T_target_source.tobytes()
-        if key not in self._refined:  # a second look often likes what the first one did
-            self._refined[key] = self._refined_anew(hypothesis)
-        found = self._refined[key]
-        if hypothesis.verdict is None:
-            return found._replace(evidence=replace(found.evidence, verdict=verdict))
-        if found.evidence.verdict is None and self._network is not None:
-            after = found.T_target_source.tobytes()
-            judged = self._judged.get(after) or self._network(found.T_target_source[None])[0]
-            evidence = replace(found.evidence, verdict=judged.verdict)
-            found = found._replace(evidence=evidence, judged=judged)
-            self._refined[key] = found
-        return found
+        if hypothesis.refined is None:  # a second look often likes what the first one did
+            hypothesis.refined = self._refined(hypothesis)
+        refined = hypothesis.refined
+        same = refined.T_target_source is hypothesis.T_target_source
+        for name in self._scorers:
+            if name == SURFACES or name not in hypothesis.scores or name in refined.asked:
+                continue
+            if name not in hypothesis.asked or same:
+                refined.scores[name] = hypothesis.scores[name]
+                refined.asked |= hypothesis.asked & {name}
+            else:
+                self._ask(name, [refined])
+        return refined
 
-    def _refined_anew(self, hypothesis: Hypothesis) -> Refined:
-        """By the clouds alone."""
-        T, note = self._refiner(hypothesis.T_target_source)
-        before, after = (self._verifier.evidence(motion) for motion in (hypothesis.T_target_source, T))
-        if after.score < _KEPT_EVIDENCE * before.score:
-            note = "refinement made the clouds fit less well; the unrefined motion is given"
-            return Refined(hypothesis.T_target_source, before, note, None)
-        return Refined(T, after, note, None)
+    def _refined(self, hypothesis: Hypothesis) -> Hypothesis:
+        """Refined, and scored by the clouds alone."""
+        T, note = self._refiner(hypothesis)
+        start = replace(hypothesis, scores={}, asked=set(), note=note)
+        refined = start if T is None else replace(start, T_target_source=T, scores={}, asked=set())
+        self._ask(SURFACES, [start])
+        self._ask(SURFACES, [refined])
+        if evidence_of(refined).surface_score < _KEPT_EVIDENCE * evidence_of(start).surface_score:
+            return replace(
+                start, note="refinement made the clouds fit less well; the unrefined transform is given"
+            )
+        return refined
 
-    def _rival(self, answer: Refined) -> tuple[Hypothesis | None, float, Evidence | None]:
-        """The best clearly different motion, the answer's lead over it, and its evidence."""
-        T, source = answer.T_target_source, self._described[0]
-        other = clearly_different(self._ranked, T, source, self._shift)
-        lead = lead_over(answer.evidence, other[1] if other else None)
-        # A fair race: a rival that the clouds like about as well is refined too, and judged again.
-        if other is not None and lead_over(answer.evidence.by_clouds(), other[1].by_clouds()) < _CLOSE_LEAD:
-            rival = self._refine(other[0], other[1].verdict)
-            if rival.evidence.score > other[1].score:
-                moved = replace(other[0], T_target_source=rival.T_target_source), rival.evidence
-                other = clearly_different([moved], T, source, self._shift) or other
-                lead = lead_over(answer.evidence, other[1])
-        return (other[0], lead, other[1]) if other else (None, lead, None)
+    def _rival(self, answer: Hypothesis) -> tuple[Hypothesis | None, float]:
+        """The best clearly different hypothesis, and the answer's lead over it."""
+        other = self._different_from(answer, self.hypotheses)
+        if other is None:
+            return None, lead_over(answer.score, None)
+        # A fair race: a rival that the clouds like about as well is refined too, and scored again.
+        by_clouds = (evidence_of(h).surface_score for h in (answer, other))
+        if lead_over(*by_clouds) < _CLOSE_LEAD:
+            refined = self._refine(other)
+            if refined.score > other.score:
+                other = self._different_from(answer, [refined]) or other
+        return other, lead_over(answer.score, other.score)
 
-    def _support(self, T_target_source: FloatArray) -> float:
-        """Share of the correspondences that agree with a motion."""
-        if len(self._matched) == 0:
+    def _different_from(self, answer: Hypothesis, ranked: Iterable[Hypothesis]) -> Hypothesis | None:
+        return clearly_different(ranked, answer.T_target_source, self._source, self._shift)
+
+    def _overruled(self, answer: Hypothesis) -> str | None:
+        """A sentence where the answer is clearly another transform than the user's first guess, refined."""
+        if self._guess is None:
+            return None
+        T, guess = answer.T_target_source, self._guess
+        if not are_different(T, guess, self._source, self._shift):
+            return None
+        shift, turn = motions_apart(T, guess, self._source.points.mean(0))
+        return f"the first guess is not the answer: refined, it lies {turn:.1f} deg and {shift:.3g} away"
+
+    def _support(self, answer: Hypothesis) -> float:
+        """Share of the correspondences that agree with the answer."""
+        matched = self._pair.matched
+        if len(matched) == 0:
             return 0.0
-        gaps = residuals(T_target_source, self._matched.source, self._matched.target)
-        return float((gaps < self._threshold).mean())
+        gaps = residuals(answer.T_target_source, matched.source, matched.target)
+        return float((gaps < self._pair.inlier_threshold).mean())
 
     @property
     def _shift(self) -> float:
-        return _DISTINCT_THRESHOLDS * self._threshold
+        return _DISTINCT_THRESHOLDS * self._pair.inlier_threshold
+
+
+def distinct(
+    ranked: Iterable[Hypothesis], source: PreparedCloud, max_shift: float, limit: int
+) -> list[Hypothesis]:
+    """The best hypotheses that are all different transforms, at most ``limit``; see `clearly_different`."""
+    chosen: list[Hypothesis] = []
+    for hypothesis in ranked:
+        if len(chosen) == limit:
+            break
+        T = hypothesis.T_target_source
+        if all(are_different(c.T_target_source, T, source, max_shift) for c in chosen):
+            chosen.append(hypothesis)
+    return chosen
+
+
+def clearly_different(
+    ranked: Iterable[Hypothesis], T_target_source: FloatArray, source: PreparedCloud, max_shift: float
+) -> Hypothesis | None:
+    """The first hypothesis that is another transform than the given one, or None; see `are_different`.
+
+    Args:
+        ranked: candidates, best first.
+        T_target_source: (4, 4) the transform to differ from.
+        source, max_shift: as in `are_different`.
+    """
+    for hypothesis in ranked:
+        if are_different(T_target_source, hypothesis.T_target_source, source, max_shift):
+            return hypothesis
+    return None
+
+
+def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_shift: float) -> bool:
+    """Whether two transforms (4, 4) are clearly different.
+
+    Args:
+        T_a, T_b: target from source.
+        source: its centroid is where shifts are measured.
+        max_shift: transforms closer than this, cloud units, and closer than 15 degrees are the same.
+    """
+    shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
+    return shift > max_shift or turn > _MOST_TURN_DEG

@@ -1,24 +1,41 @@
-"""The one form of an estimator, the checks they share, and the choice by name."""
+"""What an estimator is: weighted correspondences in, candidate transforms out; and the checks they share.
+
+Place: propose, between outlier rejection and score.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import abstractmethod
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.config import EstimatorConfig
-from geomoe3d.errors import ConfigError, InputError
+from geomoe3d.errors import InputError
+from geomoe3d.parts import Part, Registry
 from geomoe3d.types import FloatArray, Hypothesis
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
-class Estimator(Protocol):
+    from geomoe3d.estimators.surroundings import Surroundings
+
+
+class Estimator(Part):
     """Anything that turns weighted correspondences into hypotheses.
 
-    One that can use normals at the points and what the sensors saw offers moreover ``with_surroundings``: it
-    takes `geomoe3d.estimators.surroundings.Surroundings` of the same rows and returns such an estimator.
+    Attributes:
+        uses_surroundings: whether it is to be given what surrounds the correspondences: normals at the points
+            and what the sensors saw.
     """
 
+    uses_surroundings: ClassVar[bool] = False
+
+    def with_less_effort(self) -> Self:
+        """The same where every proposal is drawn closer by others before it is scored; here itself."""
+        return self
+
+    @abstractmethod
     def __call__(
         self,
         correspondences: ArrayLike,
@@ -26,8 +43,9 @@ class Estimator(Protocol):
         *,
         inlier_threshold: float,
         seed: int = 0,
+        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
-        """Estimate rigid motions p_target = R p_source + t.
+        """Estimate rigid transforms p_target = R p_source + t.
 
         Args:
             correspondences: (N, 6) rows [source xyz, target xyz], one unit of length; extents up to
@@ -35,6 +53,7 @@ class Estimator(Protocol):
             weights: (N,) non-negative, or None for all ones.
             inlier_threshold: largest residual of an inlier, same unit.
             seed: decides every random choice.
+            surroundings: of the same rows, for those that use them; else None.
 
         Returns:
             Distinct hypotheses, best first; empty where the correspondences do not determine a motion
@@ -43,7 +62,10 @@ class Estimator(Protocol):
         Raises:
             InputError: wrong shapes, non-finite numbers, negative weights, a threshold <= 0.
         """
-        ...
+
+
+estimator: Registry[Estimator] = Registry("estimator", "geomoe3d.estimators", lambda: Estimator)
+"""Decorator by which an estimator joins, and the choice by name."""
 
 
 def check_correspondences(
@@ -66,20 +88,3 @@ def check_correspondences(
     if not (np.isfinite(inlier_threshold) and inlier_threshold > 0):
         raise InputError(f"inlier_threshold must be a positive length, found {inlier_threshold}")
     return rows, w
-
-
-def make_estimator(config: EstimatorConfig) -> Estimator:
-    """The estimator that a configuration names."""
-    if config.name == "consensus":
-        from geomoe3d.estimators.consensus import ConsensusEstimator
-
-        return ConsensusEstimator(num_hypotheses=config.num_hypotheses)
-    if config.name == "ransac":
-        from geomoe3d.estimators.ransac import RansacEstimator
-
-        return RansacEstimator(iterations=config.ransac_iterations, confidence=config.ransac_confidence)
-    if config.name == "svd":
-        from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
-
-        return WeightedSvdEstimator()
-    raise ConfigError(f"unknown estimator '{config.name}'; known: consensus, ransac, svd")

@@ -20,25 +20,30 @@ surrounds them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.estimators.base import Estimator, check_correspondences
+from geomoe3d.config import EstimatorConfig
+from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread_shared, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, IntArray
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 _BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
 _SCORED_AT_ONCE = 500_000
 
 
+@estimator("consensus")
 @dataclass(frozen=True)
-class ConsensusEstimator:
+class ConsensusEstimator(Estimator):
     """Consensus about lengths and planes; deterministic for a given seed.
 
     Attributes:
@@ -68,10 +73,16 @@ class ConsensusEstimator:
     distinct_angle_deg: float = 15.0
     distinct_thresholds: float = 3.0
     max_dense: int = 5000
+    uses_surroundings: ClassVar[bool] = True
 
-    def with_surroundings(self, surroundings: Surroundings) -> Estimator:
-        """The same, asking what surrounds the correspondences that it will be given, in their order."""
-        return partial(self, surroundings=surroundings)
+    @classmethod
+    def from_config(cls, config: EstimatorConfig) -> Self:
+        """With as many hypotheses as configured."""
+        return cls(num_hypotheses=config.num_hypotheses)
+
+    def with_less_effort(self) -> Self:
+        """Fewer seeds, and fewer proposals refined: what is drawn closer need not be proposed so well."""
+        return replace(self, num_seeds=500, num_refined=60)
 
     @single_blas_thread()
     def __call__(

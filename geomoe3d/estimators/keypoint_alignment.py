@@ -72,7 +72,7 @@ class KeypointAligner:
     def hypotheses(self, found: list[Hypothesis]) -> list[Hypothesis]:
         """The same hypotheses, in order, with their motions drawn closer and their inliers counted anew.
 
-        Scores stay what the estimator gave.
+        Their own scores stay what the estimator gave.
         """
         drawn = [self(h.T_target_source) for h in found]
         return [

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.estimators.base import check_correspondences
+from geomoe3d.config import EstimatorConfig
+from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray, Hypothesis
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from geomoe3d.estimators.surroundings import Surroundings
+
 _MOST_REFITS = 50
 
 
+@estimator("ransac")
 @dataclass(frozen=True)
-class RansacEstimator:
+class RansacEstimator(Estimator):
     """Open3D's RANSAC with the edge-length and distance checkers.
 
     Attributes:
@@ -29,6 +37,11 @@ class RansacEstimator:
     confidence: float = 0.999
     edge_length_similarity: float = 0.9
 
+    @classmethod
+    def from_config(cls, config: EstimatorConfig) -> Self:
+        """With as many samples as configured."""
+        return cls(iterations=config.ransac_iterations, confidence=config.ransac_confidence)
+
     def __call__(
         self,
         correspondences: ArrayLike,
@@ -36,6 +49,7 @@ class RansacEstimator:
         *,
         inlier_threshold: float,
         seed: int = 0,
+        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
         """See `Estimator`. Weights only select: correspondences of weight zero are left out.
 

@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.estimators.base import check_correspondences
+from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import Hypothesis
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
+    from geomoe3d.estimators.surroundings import Surroundings
+
+
+@estimator("svd")
 @dataclass(frozen=True)
-class WeightedSvdEstimator:
+class WeightedSvdEstimator(Estimator):
     """Weighted Kabsch over all correspondences.
 
     This is the numpy form; `geomoe3d.geometry.kabsch.weighted_kabsch` is the batched differentiable twin.
     """
+
+    @classmethod
+    def from_config(cls, config: object) -> Self:
+        """There is nothing to configure."""
+        return cls()
 
     def __call__(
         self,
@@ -27,8 +39,9 @@ class WeightedSvdEstimator:
         *,
         inlier_threshold: float,
         seed: int = 0,
+        surroundings: Surroundings | None = None,
     ) -> list[Hypothesis]:
-        """See `Estimator`. Returns one hypothesis or none; ``seed`` is not used."""
+        """See `Estimator`. Returns one hypothesis or none; ``seed`` and ``surroundings`` are not used."""
         rows, w = check_correspondences(correspondences, weights, inlier_threshold)
         source, target = rows[:, :3], rows[:, 3:]
         if (w > 0).sum() < 3 or min(spread(source, w), spread(target, w)) < 1e-6 * inlier_threshold:

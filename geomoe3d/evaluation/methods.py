@@ -3,59 +3,39 @@
 ``geomoe3d`` is the whole product with any configuration; ``geomoe`` (the shipped network on what consensus
 proposes), ``geomoe-svd`` (weighted least squares on its weights alone), ``consensus`` and ``svd`` are parts
 of it with a fixed one, to compare against. Peers are in `peers`, functions of the user in `adapter`. The
-identity of ours holds the hash of the source that decides answers: a cache never mixes two versions of it.
+identity of ours holds that of every part and of the source that decides answers: a cache never mixes two versions.
 """
 
 from __future__ import annotations
 
 import difflib
-import hashlib
 import importlib.util
 from collections.abc import Sequence
-from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from geomoe3d.config import RegistrationConfig, load_config
-from geomoe3d.correspondence_registration import CorrespondenceSolver
+from geomoe3d.correspondence_registration import CorrespondenceRegistrar
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.evaluation.adapter import AdaptedFunction
-from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.peers import PEERS
 from geomoe3d.evaluation.records import Answer, Method, MethodInput
-from geomoe3d.filters.base import FilterOutput, resolved
-from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, find_weights
-from geomoe3d.types import BoolArray, FloatArray
+from geomoe3d.pipeline import Pipeline, resolved
+from geomoe3d.scoring.network import NETWORK
+from geomoe3d.types import BoolArray, FilterOutput, FloatArray
 
 if TYPE_CHECKING:
     from geomoe3d.registration import Registrar
 
 OURS: dict[str, tuple[str, ...]] = {
     "geomoe3d": (),
-    "geomoe": ("filter.name=geomoe", "estimator.name=consensus"),
-    "geomoe-svd": ("filter.name=geomoe", "estimator.name=svd"),
-    "consensus": ("filter.name=none", "estimator.name=consensus"),
-    "svd": ("filter.name=none", "estimator.name=svd"),
+    "geomoe": ("scoring.scorers=[surfaces, network]",),
+    "geomoe-svd": ("scoring.scorers=[surfaces, network]", "refinement.name=svd"),
+    "consensus": ("scoring.scorers=[surfaces]",),
+    "svd": ("scoring.scorers=[surfaces]", "estimator.name=svd"),
 }
 """Our methods and what each sets; all but ``geomoe3d`` take correspondences alone and are fixed."""
-
-_UNDECIDING = frozenset({"evaluation", "cli", "visual", "data", "training", "batch", "multiway"})
-_UNDECIDING_FILES = frozenset(
-    {
-        "__main__.py",
-        "clouds/transform_files.py",
-        "doctor.py",
-        "runtime/config_text.py",
-        "runtime/files.py",
-        "runtime/journal.py",
-        "runtime/machine.py",
-        "runtime/provenance.py",
-        "runtime/workers.py",
-    }
-)
-_MATCHING_CHANNELS = frozenset({"feature_distance", "ratio", "mutual"})
 
 
 def method_names() -> list[str]:
@@ -117,34 +97,26 @@ class OurMethod:
         self.config: RegistrationConfig = resolved(load_config(None, [*OURS[name], *assignments]))
         self._own_threshold = "estimator.inlier_threshold" in keys
         self._registrar: Registrar | None = None
-        self._solver: CorrespondenceSolver | None = None
+        self._solver: CorrespondenceRegistrar | None = None
         if self.absent() is None:
-            self._solver = CorrespondenceSolver(self.config)
-            network = getattr(self._solver.filter, "config", None)
-            if _MATCHING_CHANNELS & set(getattr(network, "extra_channels", ())):
-                self.inputs -= {"correspondences"}  # bare coordinates lack what the network was trained with
+            self._solver = CorrespondenceRegistrar(self.config)
+            chosen = self._solver.pipeline.filter
+            if chosen is not None and chosen.needs:
+                self.inputs -= {"correspondences"}  # bare coordinates lack what the filter needs
 
     def identity(self) -> dict[str, Any]:
-        """Configuration, hash of the deciding source, versions of libraries, hash of trained weights."""
+        """Configuration, and the identity of the pipeline: code, parts with their weights, versions."""
         config = self.config.model_dump(mode="json")
         config.pop("seed")
-        libraries = ["numpy", "scipy", "open3d-cpu", "open3d", "small_gicp"]
-        if self.config.filter.name == "geomoe":
-            libraries.append("torch")
-        return {
-            "config": config,
-            "own_threshold": self._own_threshold,
-            "source_sha256": source_hash(),
-            "versions": versions(*libraries),
-            "weights_sha256": self._weights_hash(),
-        }
+        line = Pipeline(self.config) if self._solver is None else self._solver.pipeline
+        return {"config": config, "own_threshold": self._own_threshold, **line.identity()}
 
     def absent(self) -> str | None:
-        """Whether the filter's library is missing, and how to install it."""
-        if self.config.filter.name == "geomoe":
+        """Whether a library that the network needs is missing, and how to install it."""
+        if NETWORK in self.config.scoring.scorers or self.config.filter.name == "geomoe":
             for module in ("torch", "safetensors"):
                 if importlib.util.find_spec(module) is None:
-                    return f"the filter 'geomoe' needs {module}, which is not installed: pip install {module}"
+                    return f"the network needs {module}, which is not installed: pip install {module}"
         return None
 
     def __call__(self, given: MethodInput) -> Answer:
@@ -202,34 +174,8 @@ class OurMethod:
 
     def _weights(self, weighed: FilterOutput) -> FloatArray | None:
         """None where nothing was weighed: ones say nothing."""
-        return None if self.config.filter.name == "none" else weighed.weights
-
-    def _weights_hash(self) -> str | None:
-        if self.config.filter.name != "geomoe" or self.absent() is not None:
-            return None
-        path = find_weights(self.config.filter.weights or DEFAULT_WEIGHTS)
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-@lru_cache(maxsize=1)
-def source_hash() -> str:
-    """Hash over every source file of the package that can change an answer, hexadecimal.
-
-    Evaluation, command line, pictures, data and training cannot; whatever else is added later counts.
-    """
-    return hash_sources(Path(__file__).resolve().parents[1])
-
-
-def hash_sources(root: Path) -> str:
-    """Hash over names and contents of the deciding ``.py`` files below a package's folder."""
-    total = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        parts = path.relative_to(root).parts
-        if parts[0] in _UNDECIDING or "/".join(parts) in _UNDECIDING_FILES:
-            continue
-        total.update("/".join(parts).encode() + b"\0")
-        total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()
+        anything = self.config.filter.name != "none" or NETWORK in self.config.scoring.scorers
+        return weighed.weights if anything else None
 
 
 def _declared(weighed: FilterOutput) -> BoolArray | None:

@@ -129,7 +129,7 @@ def feature_ransac(
     thinned = [_thinned(points, given.voxel_size) for points in (source, target)]
     if min(len(cloud.points) for cloud in thinned) < 3:
         return Answer(None)
-    clock("describe")
+    clock("features")
     search = o3d.geometry.KDTreeSearchParamHybrid(5 * given.voxel_size, 100)
     features = [
         registration.compute_fpfh_feature(cloud, search)  # type: ignore[call-arg]

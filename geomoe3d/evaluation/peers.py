@@ -96,7 +96,7 @@ def kiss_matcher(source: FloatArray, target: FloatArray, given: MethodInput) -> 
     T = make_transform(np.array(answer.rotation), np.array(answer.translation).ravel())
     stages = {
         "prepare": matcher.get_processing_time(),
-        "describe": matcher.get_extraction_time(),
+        "features": matcher.get_extraction_time(),
         "match": matcher.get_matching_time(),
         "solve": matcher.get_rejection_time() + matcher.get_solver_time(),
     }

@@ -1,28 +1,31 @@
-"""The one form of a filter, and the choice by name.
+"""What an outlier filter is: correspondences in, one weight each out.
 
-A filter gives every putative correspondence a weight and drops nothing. Place:
-weigh, between match and solve. New filters join by a line in `_FACTORIES`; the pipeline does not change.
+Place: outlier rejection, between match and propose. A filter drops nothing and proposes nothing.
 """
 
 from __future__ import annotations
 
-import difflib
-import importlib.util
-from collections.abc import Callable
-from typing import Protocol
+from abc import abstractmethod
+from typing import ClassVar
 
 import numpy as np
 
-from geomoe3d.config import EstimatorConfig, FilterConfig, RegistrationConfig
-from geomoe3d.errors import ConfigError, DependencyError
-from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, packaged_names
-from geomoe3d.types import Correspondences
-from geomoe3d.types import FilterOutput as FilterOutput  # part of the form, offered here too
+from geomoe3d.parts import Part, Registry
+from geomoe3d.types import Correspondences, FilterOutput
 
 
-class Filter(Protocol):
-    """Anything that weighs correspondences."""
+class OutlierFilter(Part):
+    """Anything that weighs correspondences.
 
+    Attributes:
+        needs: attributes of `Correspondences` beside the points without which it cannot work.
+        takes_weights: whether it is a trained network, made with ``filter.weights``.
+    """
+
+    needs: frozenset[str] = frozenset()
+    takes_weights: ClassVar[bool] = False
+
+    @abstractmethod
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
         """Weigh correspondences.
 
@@ -34,93 +37,21 @@ class Filter(Protocol):
         Returns:
             One weight per correspondence; for N = 0 an empty array.
         """
-        ...
 
 
-class NoFilter:
+outlier_filter: Registry[OutlierFilter] = Registry("filter", "geomoe3d.filters", lambda: OutlierFilter)
+"""Decorator by which an outlier filter joins, and the choice by name."""
+
+
+@outlier_filter("none")
+class NoFilter(OutlierFilter):
     """All correspondences weigh the same."""
 
+    @classmethod
+    def from_config(cls, config: object) -> NoFilter:
+        """There is nothing to configure."""
+        return cls()
+
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
-        """See `Filter`: all ones."""
+        """See `OutlierFilter`: all ones."""
         return FilterOutput(np.ones(len(correspondences)))
-
-
-def _none(weights: str | None, estimator: EstimatorConfig) -> Filter:
-    return NoFilter()
-
-
-def _spectral(weights: str | None, estimator: EstimatorConfig) -> Filter:
-    from geomoe3d.filters.spectral import SpectralFilter
-
-    return SpectralFilter()
-
-
-def _geomoe(weights: str | None, estimator: EstimatorConfig) -> Filter:
-    try:
-        from geomoe3d.filters.network import geomoe_filter
-    except ImportError as error:
-        raise DependencyError(
-            f"the filter 'geomoe' needs PyTorch and safetensors ({error}); `geomoe3d doctor` gives the "
-            "command that installs them, or use --filter none"
-        ) from error
-    return geomoe_filter(weights, estimator)
-
-
-_FACTORIES: dict[str, Callable[[str | None, EstimatorConfig], Filter]] = {
-    "none": _none,
-    "spectral": _spectral,
-    "geomoe": _geomoe,
-}
-
-
-def filter_names() -> list[str]:
-    """Names that `make_filter` knows."""
-    return list(_FACTORIES)
-
-
-def resolve_filter(config: FilterConfig) -> FilterConfig:
-    """What ``auto`` means on this machine; any other name as it is.
-
-    The network is taken where weights are given, and where its libraries are installed and weights ship with
-    the package.
-    """
-    if config.name != "auto":
-        return config
-    installed = all(importlib.util.find_spec(name) is not None for name in ("torch", "safetensors"))
-    usable = config.weights is not None or (installed and DEFAULT_WEIGHTS in packaged_names())
-    return config.model_copy(update={"name": "geomoe" if usable else "none"})
-
-
-def resolved(config: RegistrationConfig | None) -> RegistrationConfig:
-    """The configuration, None for the defaults, with ``auto`` replaced by what it means on this machine.
-
-    Raises:
-        ConfigError: something else than a configuration.
-    """
-    config = RegistrationConfig() if config is None else config
-    if not isinstance(config, RegistrationConfig):
-        raise ConfigError(
-            f"config is a {type(config).__name__}, expected a RegistrationConfig; load_config(path, "
-            f"['key=value', ...]) makes one"
-        )
-    return config.model_copy(update={"filter": resolve_filter(config.filter)})
-
-
-def make_filter(name: str, weights: str | None = None, estimator: EstimatorConfig | None = None) -> Filter:
-    """The filter of a given name.
-
-    Args:
-        name: one of `filter_names`; ``auto`` is resolved by `resolve_filter` before.
-        weights: file or name of trained weights, for filters that have any; None takes the shipped ones.
-        estimator: what proposes motions to filters that judge some; None takes the defaults.
-
-    Raises:
-        ConfigError: no filter has this name; the message gives the nearest one.
-        CheckpointError: the weights are missing, broken or do not fit.
-        DependencyError: a library that the filter needs is not installed.
-    """
-    if name in _FACTORIES:
-        return _FACTORIES[name](weights, estimator or EstimatorConfig())
-    close = difflib.get_close_matches(name, _FACTORIES, n=1, cutoff=0.4)
-    hint = f"did you mean '{close[0]}'?" if close else "known: " + ", ".join(_FACTORIES)
-    raise ConfigError(f"unknown filter '{name}'; {hint}")

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.filters.base import OutlierFilter, outlier_filter
 from geomoe3d.types import Correspondences, FilterOutput, Float32Array
 
 
+@outlier_filter("spectral")
 @dataclass(frozen=True)
-class SpectralFilter:
+class SpectralFilter(OutlierFilter):
     """Leading eigenvector of C_ij = max(0, 1 - (| |p_i-p_j| - |q_i-q_j| | / d)^2), largest entry 1.
 
     Attributes:
@@ -29,7 +31,7 @@ class SpectralFilter:
     max_anchors: int = 3000
 
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
-        """See `Filter`. Without any compatible pair all weights are zero."""
+        """See `OutlierFilter`. Without any compatible pair all weights are zero."""
         count = len(correspondences)
         if count == 0:
             return FilterOutput(np.zeros(0))

@@ -7,15 +7,51 @@ thread; O(n m) time: on two cores 5,000 against 5,000 points take some 20 ms, 30
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
+from geomoe3d.matching.base import Matcher, matcher
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 _BLOCK_ENTRIES = 3_000_000
+
+
+@matcher("one_way", "mutual", "ratio")
+@dataclass(frozen=True)
+class NearestMatcher(Matcher):
+    """Nearest neighbours in feature space; see `match`.
+
+    Attributes:
+        config: method (its name), neighbours and largest ratio; the limit of the call counts.
+    """
+
+    config: MatchingConfig = field(default_factory=MatchingConfig)
+
+    @classmethod
+    def from_config(cls, config: MatchingConfig) -> Self:
+        """As configured."""
+        return cls(config)
+
+    def __call__(
+        self,
+        source: PreparedCloud,
+        target: PreparedCloud,
+        *,
+        limit: int,
+        seed: int = 0,
+        with_ratio: bool = False,
+    ) -> Correspondences:
+        """See `Matcher`."""
+        config = self.config.model_copy(update={"max_correspondences": limit})
+        return match(source, target, config, seed=seed, with_ratio=with_ratio)
 
 
 def match(
@@ -26,7 +62,7 @@ def match(
     seed: int = 0,
     with_ratio: bool = True,
 ) -> Correspondences:
-    """Putative correspondences between two described clouds.
+    """Putative correspondences between two clouds with features.
 
     Methods: ``one_way`` keeps for every source point its nearest targets; ``mutual`` of these only pairs
     that are each other's nearest; ``ratio`` only pairs whose distance is at most ``max_ratio`` of the
@@ -35,8 +71,8 @@ def match(
     motion less well than random ones do.)
 
     Args:
-        source: described cloud.
-        target: described cloud.
+        source: cloud with features.
+        target: cloud with features.
         config: see above.
         seed: decides what is kept beyond the limit.
         with_ratio: False leaves the ratio out, a quarter of the time, unless the method needs it.
@@ -45,27 +81,25 @@ def match(
         InputError: a cloud without features.
     """
     if source.features is None or target.features is None:
-        raise InputError("match needs described clouds; call describe(cloud, config) on both first")
+        raise InputError(
+            "match needs clouds with features; call with_features(cloud, descriptor) on both first"
+        )
     index, distance, ratio, mutual = nearest_features(
-        source.features, target.features, config.neighbors, with_ratio or config.method == "ratio"
+        source.features, target.features, config.neighbors, with_ratio or config.name == "ratio"
     )
     rows = np.repeat(np.arange(len(source)), index.shape[1])
     columns, mutual = index.ravel(), mutual.ravel()
     keep: BoolArray = np.ones(len(rows), dtype=np.bool_)
-    if config.method == "mutual":
+    if config.name == "mutual":
         keep = mutual
-    elif config.method == "ratio":
+    elif config.name == "ratio":
         assert ratio is not None
         keep = ratio.ravel() <= config.max_ratio
-    found = Correspondences(
-        np.hstack([source.points[rows], target.points[columns]]),
-        rows,
-        columns,
-        distance.ravel(),
-        None if ratio is None else ratio.ravel(),
-        mutual,
-        normals=(source.normals[rows], target.normals[columns]),
-        normals_signed=source.viewpoint is not None and target.viewpoint is not None,
+    found = replace(
+        Correspondences.between(source, target, rows, columns),
+        feature_distance=distance.ravel(),
+        ratio=None if ratio is None else ratio.ravel(),
+        mutual=mutual,
     ).take(keep)
     if len(found) <= config.max_correspondences:
         return found

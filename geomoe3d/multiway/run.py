@@ -21,7 +21,6 @@ from geomoe3d.batch.task import Settings
 from geomoe3d.clouds.formats.e57 import require_pye57
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.errors import InputError
-from geomoe3d.filters.base import resolved
 from geomoe3d.multiway.assembly import Assembly
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
 from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
@@ -31,6 +30,7 @@ from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_
 from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
 from geomoe3d.multiway.survey import Survey
+from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.timing import StageClock
 
 _MAP_ROUNDS = 2

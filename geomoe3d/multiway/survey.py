@@ -129,7 +129,7 @@ class Survey:
                     raise InputError(unusable[scan.name])
                 cloud = load_points(scan.path)
                 view = find_viewpoints(cloud, cloud, self.config.preparation.viewpoint)[0]
-                described = registrar.describe_cloud(cloud, self.voxel_size, view, StageClock())
+                described = registrar.pipeline.prepare(cloud, self.voxel_size, view, StageClock())
             except GeoMoE3DError as error:
                 self.unusable[number] = str(error)
                 continue

@@ -17,7 +17,7 @@ from geomoe3d.errors import CheckpointError, ConfigError
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.build import Network, build_network
 from geomoe3d.networks.geomoe import GeoMoE
-from geomoe3d.networks.weight_files import find_weights
+from geomoe3d.networks.weight_files import check_weights, find_weights
 from geomoe3d.runtime.files import check_output, write_atomically, write_text
 
 _FORMAT = "geomoe3d-weights"
@@ -118,18 +118,9 @@ def load_network(name_or_path: str | Path) -> tuple[Network, WeightCard]:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    path = find_weights(name_or_path)
-    card = read_card(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"cannot read '{path}': {error.strerror or error}") from None
-    digest = hashlib.sha256(data).hexdigest()
-    if digest != card.sha256:
-        raise CheckpointError(
-            f"'{path}' does not match its card: sha256 {digest[:16]}..., card says {card.sha256[:16]}...; "
-            f"the file is damaged or belongs to another card; fetch or export both again"
-        )
+    card = read_card(find_weights(name_or_path))
+    path = check_weights(name_or_path)
+    data = path.read_bytes()
     try:
         config = build_config(NetworkConfig, card.architecture, f"architecture in '{card_path(path)}'")
         tensors = load(data)

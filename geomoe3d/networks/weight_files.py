@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 from geomoe3d.errors import CheckpointError
@@ -30,3 +32,53 @@ def find_weights(name_or_path: str | Path) -> Path:
 def packaged_names() -> list[str]:
     """Names of the weights that ship with the package."""
     return sorted(path.stem for path in PACKAGED.glob("*.safetensors"))
+
+
+def judges_transforms(name_or_path: str | Path) -> bool:
+    """Whether weights are of a network that judges transforms, by their card; False where there is no card.
+
+    Raises:
+        CheckpointError: no such weights.
+    """
+    card = find_weights(name_or_path).with_suffix(".json")
+    try:
+        architecture = json.loads(card.read_text(encoding="utf-8"))["architecture"]
+        return "aligned" in architecture.get("extra_channels", ())
+    except (OSError, ValueError, KeyError, AttributeError, TypeError):
+        return False  # loading the weights says what is wrong with the card
+
+
+def check_weights(name_or_path: str | Path) -> Path:
+    """The file that a name or path means, whose content is what its card says; needs no torch.
+
+    Raises:
+        CheckpointError: not found, without a card, or damaged.
+    """
+    path = find_weights(name_or_path)
+    place = path.with_suffix(".json")
+    try:
+        expected = json.loads(place.read_text(encoding="utf-8"))["sha256"]
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"'{path}' has no card: '{place}' is missing; keep both files together"
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"card '{place}' cannot be read: {error}") from None
+    if (digest := file_hash(path)) != expected:
+        raise CheckpointError(
+            f"'{path}' does not match its card: sha256 {digest[:16]}..., card says {str(expected)[:16]}...; "
+            f"the file is damaged or belongs to another card; fetch or export both again"
+        )
+    return path
+
+
+def file_hash(path: Path) -> str:
+    """sha256 of a file, hexadecimal.
+
+    Raises:
+        CheckpointError: it cannot be read.
+    """
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"cannot read '{path}': {error.strerror or error}") from None

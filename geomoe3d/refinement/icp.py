@@ -1,6 +1,6 @@
-"""Local refinement of one motion on the clouds: point-to-plane ICP or GICP, by small_gicp.
+"""Refinement of one transform on the clouds: point-to-plane ICP or GICP, by small_gicp.
 
-Place: refine, between verify and judge. The alignment uses one thread, so that the same input gives the same
+The alignment uses one thread, so that the same input gives the same
 bytes on any machine; two clouds of 5,000 points take some 15 ms, since only what lies near the other cloud
 takes part: to find that a point is near nothing costs far more than to find its partner, in every step
 again. Lengths are passed in voxels, because small_gicp's stopping rule is an absolute length.
@@ -8,13 +8,16 @@ again. Lengths are passed in voxels, because small_gicp's stopping rule is an ab
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RefinementConfig
 from geomoe3d.geometry.gicp import LEAST_MATCHED, LocalCloud, align, too_few
 from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.refinement.base import PairRefiner, Refiner, refiner
 from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
@@ -25,8 +28,30 @@ _NORMAL_NEIGHBORS = 20
 _UNREFINED = "the unrefined motion is given"
 
 
-class Refiner:
-    """Polishes motions of one pair of clouds.
+@refiner("icp", "gicp")
+@dataclass(frozen=True)
+class IcpRefiner(Refiner):
+    """Point-to-plane ICP or GICP.
+
+    Attributes:
+        config: method (its name), reach and iterations.
+    """
+
+    config: RefinementConfig = field(default_factory=RefinementConfig)
+
+    @classmethod
+    def from_config(cls, config: RefinementConfig) -> IcpRefiner:
+        """As configured."""
+        return cls(config)
+
+    def about(self, pair: Pair) -> PairRefiner:
+        """See `geomoe3d.refinement.base.Refiner`."""
+        aligner = CloudAligner(*pair.clouds, self.config)
+        return lambda hypothesis: aligner(hypothesis.T_target_source)
+
+
+class CloudAligner:
+    """Polishes transforms of one pair of clouds.
 
     Args:
         source: prepared cloud.
@@ -57,8 +82,6 @@ class Refiner:
             and the distance moved are checked here.
         """
         config = self._config
-        if config.method == "none":
-            return T_target_source, None
         voxel = self._voxel
         start = T_target_source.copy()
         start[:3, 3] /= voxel
@@ -68,12 +91,12 @@ class Refiner:
         if num_matched < LEAST_MATCHED:
             return T_target_source, f"{too_few(num_matched)}; {_UNREFINED}"
         found = align(
-            LocalCloud.of(self._source[near_target], _NORMAL_NEIGHBORS if config.method == "gicp" else None),
+            LocalCloud.of(self._source[near_target], _NORMAL_NEIGHBORS if config.name == "gicp" else None),
             LocalCloud.of(self._target[near_source], _NORMAL_NEIGHBORS),
             start,
             self._centre,
             reach=config.max_distance,
-            method=config.method,
+            method=config.name,
             max_iterations=config.max_iterations,
         )
         if found.T_target_source is None:
@@ -87,13 +110,3 @@ class Refiner:
         reach = self._config.max_distance + _MARGIN_VOXELS
         distance, _ = tree.query(points, distance_upper_bound=reach, workers=usable_threads())
         return np.flatnonzero(np.isfinite(distance))
-
-
-def refine(
-    T_target_source: FloatArray,
-    source: PreparedCloud,
-    target: PreparedCloud,
-    config: RefinementConfig,
-) -> tuple[FloatArray, str | None]:
-    """One motion (4, 4) polished; see `Refiner`, which does several of one pair."""
-    return Refiner(source, target, config)(T_target_source)

@@ -5,30 +5,35 @@ witnesses speak here. *Distinctiveness*: for each source point that lands on the
 that a random target point would look as similar (its FPFH distance ranked among random ones, an empirical
 p-value); walls look like walls and prove little, a chair on the same chair proves much. *Normals*: the two
 surfaces must face the same way. *Free space*: no point of one cloud may lie where the other's sensor looked
-through. Place: verify, between solve and refine. About 0.7 ms per hypothesis for clouds of any size, since
-at most ``num_queries`` points of each are asked.
+through. About 0.7 ms per hypothesis for clouds of any size, since at most ``num_queries`` points of each are
+asked.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.errors import InputError
-from geomoe3d.geometry.se3 import motions_apart
 from geomoe3d.runtime.threads import each
+from geomoe3d.scoring.base import Scorer, scorer
 from geomoe3d.types import FloatArray, Hypothesis, IntArray, PreparedCloud
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+SURFACES = "surfaces"
+"""Name of the scorer without which nothing is said of an answer."""
 
 _NUM_RANDOM = 256  # random target features per source point: p-values down to 1/257
 _LIFT = 4.0  # more than two similarities of unit features can differ by
 _AT_ONCE = 5  # hypotheses asked about together, for any number of threads
 _LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
 _VIOLATION_WEIGHT = 10.0  # a tenth of the visible points in free space divides the score by e
-_VERDICT_WEIGHT = 0.5
-_MOST_VERDICT = 8.0
-_MOST_TURN_DEG = 15.0
 _VISIBLE_FLOOR = 0.05  # fewer visible points than this share make the violation rate unreliable
 
 
@@ -43,41 +48,64 @@ class Evidence:
             points and 0 for the others; about zero for chance overlap, larger is better.
         free_space_violation: share of source points in target's free space over those it could see, plus
             the same with the roles exchanged; 0 where a viewpoint is neither known nor guessed.
-        verdict: logit by which a network believes in the motion, or None without one.
-        surface_score: distinctiveness x exp(-10 free_space_violation), not below zero.
-        score: surface_score x exp(verdict / 2), the verdict bounded to [-8, 8]; surface_score without one.
+        surface_score: distinctiveness x exp(-10 free_space_violation), not below zero; its factor of the score.
     """
 
     overlap: float
     agreement: float
     distinctiveness: float
     free_space_violation: float
-    verdict: float | None = None
 
     @property
     def surface_score(self) -> float:
-        """See the class; what the clouds alone say."""
+        """See the class."""
         return max(self.distinctiveness, 0.0) * float(np.exp(-_VIOLATION_WEIGHT * self.free_space_violation))
 
-    def by_clouds(self) -> Evidence:
-        """The same without what a network says."""
-        return replace(self, verdict=None)
-
     @property
-    def score(self) -> float:
-        """See the class; the quantity by which hypotheses are chosen."""
-        if self.verdict is None:
-            return self.surface_score
-        verdict = min(max(self.verdict, -_MOST_VERDICT), _MOST_VERDICT)
-        return self.surface_score * float(np.exp(_VERDICT_WEIGHT * verdict))
+    def factor(self) -> float:
+        """See `geomoe3d.types.Score`: the surface score."""
+        return self.surface_score
+
+
+@scorer(SURFACES)
+@dataclass(frozen=True)
+class SurfaceScorer(Scorer):
+    """How well the clouds lie on each other; see the module.
+
+    Attributes:
+        num_queries: points of each cloud asked at most, a seeded choice.
+    """
+
+    num_queries: int = 1500
+
+    @classmethod
+    def from_config(cls, config: object) -> Self:
+        """There is nothing to configure."""
+        return cls()
+
+    def about(self, pair: Pair) -> Verifier:
+        """See `Scorer`; for pairs with clouds."""
+        source, target = pair.clouds
+        return Verifier(source, target, pair.inlier_threshold, num_queries=self.num_queries, seed=pair.seed)
+
+
+def evidence_of(hypothesis: Hypothesis) -> Evidence:
+    """What the clouds say of a scored hypothesis.
+
+    Raises:
+        KeyError: the clouds were not asked.
+    """
+    found = hypothesis.scores[SURFACES]
+    assert isinstance(found, Evidence)
+    return found
 
 
 class Verifier:
-    """Asks two described clouds about hypotheses; build once per pair.
+    """Asks two clouds about hypotheses; build once per pair.
 
     Args:
-        source: described cloud, local coordinates.
-        target: described cloud, local coordinates.
+        source: cloud with features, local coordinates.
+        target: likewise.
         inlier_threshold: largest distance of points on the same surface, cloud units.
         num_queries: points of each cloud asked at most, a seeded choice.
         seed: decides the choice.
@@ -99,7 +127,7 @@ class Verifier:
 
         if source.features is None or target.features is None:
             raise InputError(
-                "verification needs described clouds; call describe(cloud, config) on both first"
+                "clouds without features cannot be compared; call with_features(cloud, descriptor) on both first"
             )
         rng = np.random.default_rng(seed)
         chosen = np.sort(rng.permutation(len(source))[:num_queries])
@@ -125,8 +153,13 @@ class Verifier:
             self._target_view = RangeImage.of(target.points, target.viewpoint)
 
     def evidence(self, T_target_source: FloatArray) -> Evidence:
-        """What the clouds say of one motion (4, 4) in local coordinates."""
+        """What the clouds say of one transform (4, 4) in local coordinates."""
         return self._evidence(T_target_source[None])[0]
+
+    def __call__(self, transforms: FloatArray) -> list[Evidence]:
+        """What the clouds say of transforms (K, 4, 4), one each."""
+        lots = [transforms[k : k + _AT_ONCE] for k in range(0, len(transforms), _AT_ONCE)]
+        return [evidence for lot in each(self._evidence, lots) for evidence in lot]
 
     def _evidence(self, motions: FloatArray) -> list[Evidence]:
         """Of motions (K, 4, 4), one each; asked about together, since the many small steps cost more than
@@ -176,60 +209,3 @@ class Verifier:
             through = (margins < -2 * self._threshold).sum(1)
             total += through / (seen.sum(1) + _VISIBLE_FLOOR * points.shape[1])
         return total
-
-    def rank(self, hypotheses: list[Hypothesis]) -> list[tuple[Hypothesis, Evidence]]:
-        """Hypotheses with their evidence, best first; equal evidence keeps the given order."""
-        motions = [h.T_target_source for h in hypotheses]
-        lots = [np.array(motions[k : k + _AT_ONCE]) for k in range(0, len(motions), _AT_ONCE)]
-        found = [evidence for lot in each(self._evidence, lots) for evidence in lot]
-        return best_first(list(zip(hypotheses, found, strict=True)))
-
-
-def best_first(judged: list[tuple[Hypothesis, Evidence]]) -> list[tuple[Hypothesis, Evidence]]:
-    """The same, the largest score first; equal evidence keeps the given order."""
-    return sorted(judged, key=lambda pair: (-pair[1].score, -pair[1].distinctiveness))
-
-
-def distinct(
-    ranked: list[tuple[Hypothesis, Evidence]], source: PreparedCloud, max_shift: float, limit: int
-) -> list[Hypothesis]:
-    """The best hypotheses that are all different motions, at most ``limit``; see `clearly_different`."""
-    chosen: list[Hypothesis] = []
-    for hypothesis, _ in ranked:
-        if len(chosen) == limit:
-            break
-        T = hypothesis.T_target_source
-        if all(are_different(c.T_target_source, T, source, max_shift) for c in chosen):
-            chosen.append(hypothesis)
-    return chosen
-
-
-def clearly_different(
-    ranked: list[tuple[Hypothesis, Evidence]],
-    T_target_source: FloatArray,
-    source: PreparedCloud,
-    max_shift: float,
-) -> tuple[Hypothesis, Evidence] | None:
-    """The first hypothesis that is another motion than the given one, or None; see `are_different`.
-
-    Args:
-        ranked: candidates, best first.
-        T_target_source: (4, 4) the motion to differ from.
-        source, max_shift: as in `are_different`.
-    """
-    for hypothesis, evidence in ranked:
-        if are_different(T_target_source, hypothesis.T_target_source, source, max_shift):
-            return hypothesis, evidence
-    return None
-
-
-def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_shift: float) -> bool:
-    """Whether two motions (4, 4) are clearly different.
-
-    Args:
-        T_a, T_b: target from source.
-        source: its centroid is where shifts are measured.
-        max_shift: motions closer than this, cloud units, and closer than 15 degrees are the same.
-    """
-    shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
-    return shift > max_shift or turn > _MOST_TURN_DEG

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.data.draw import DrawSettings, FragmentPool
 from geomoe3d.errors import InputError, OutputError
@@ -169,7 +170,7 @@ def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> Trainin
     threshold = _PROPOSING.inlier_threshold * pair.voxel_size
     at_zero = (np.zeros(3), np.zeros(3))
     rows = Correspondences(pair.correspondences.astype(np.float64), mutual=mutual, viewpoints=at_zero)
-    found = propose(estimator, rows, np.ones(len(rows)), _PROPOSING, inlier_threshold=threshold, seed=0)
+    found = propose(estimator, Pair(rows, pair.voxel_size, threshold), np.ones(len(rows)), _PROPOSING)
     motions = np.array([h.T_target_source for h in found]).reshape(-1, 4, 4)
     aligner = KeypointAligner(rows.points, threshold)
     for k in range(1, len(motions), 2):

@@ -9,7 +9,7 @@ import numpy as np
 from geomoe3d.visual.view import WEIGHT_THRESHOLD, RegistrationView
 
 if TYPE_CHECKING:
-    from geomoe3d.registration import Explanation
+    from geomoe3d.decision.explanation import Explanation
 
 
 def explained_view(explanation: Explanation) -> RegistrationView:
@@ -20,7 +20,8 @@ def explained_view(explanation: Explanation) -> RegistrationView:
     """
     source, target, matched = explanation.source, explanation.target, explanation.correspondences
     weighed = explanation.weighed
-    filtered = explanation.result.config["filter"]["name"] != "none"  # which weighs everything alike
+    used = explanation.result.config
+    filtered = used["filter"]["name"] != "none" or "network" in used["scoring"]["scorers"]
     groups = weighed.groups
     if groups is not None and len(np.unique(groups[weighed.weights > WEIGHT_THRESHOLD])) < 2:
         groups = None  # one colour for all would hide what agrees

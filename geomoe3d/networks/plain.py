@@ -1,31 +1,27 @@
-"""Any trained network that weighs correspondences, GeoMoE or a baseline, as a filter of the pipeline.
+"""Any trained network that weighs correspondences, GeoMoE or a baseline, run on one pair.
 
-GeoMoE has a faster way (`geomoe3d.filters.network`); this is the plain one, which serves all. Calls share
+GeoMoE has a faster way (`geomoe3d.networks.folded`); this is the plain one, which serves all. Calls share
 nothing and draw nothing at random; rows with a NaN or infinity get weight 0.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from geomoe3d.errors import CheckpointError
-from geomoe3d.filters.base import Filter
-from geomoe3d.filters.network import finite_part
 from geomoe3d.networks.build import Network
 from geomoe3d.networks.frames import THRESHOLD_VOXELS
+from geomoe3d.networks.inference import finite_part
 from geomoe3d.networks.inputs import MIN_CORRESPONDENCES, pair_input
 from geomoe3d.networks.layers import weights_from_logits
-from geomoe3d.networks.pretrained import load_network
 from geomoe3d.networks.seeded_motions import motion_residuals, seeded_motion, spread_seeds
 from geomoe3d.types import Correspondences, FilterOutput
 
 
-class NetworkFilter:
-    """A trained network as `geomoe3d.filters.base.Filter`.
+class PlainNetwork:
+    """A trained network that weighs the correspondences of one pair at a time.
 
     Weights are relu(tanh(logit)). A network that compares features (PointDSC) gives seeds and motions, as
     published: a row within r = 2 voxels under the best motion weighs 1 / (1 + (d / r)^2), any other nothing.
@@ -36,13 +32,13 @@ class NetworkFilter:
 
     def __init__(self, model: Network) -> None:
         if model.config.judges_motions:
-            raise CheckpointError("this network judges motions; MotionJudge runs it, not NetworkFilter")
+            raise CheckpointError("this network judges motions; it scores transforms, see scoring.weights")
         self.config = model.config
         self._network = model.eval()
 
     @torch.no_grad()
-    def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
-        """Weigh correspondences; see `Filter`. With fewer than 3 finite rows all weights are 0.
+    def __call__(self, correspondences: Correspondences, *, voxel_size: float) -> FilterOutput:
+        """Weigh correspondences. With fewer than 3 finite rows all weights are 0.
 
         Raises:
             InputError: the network was trained with a channel that these correspondences lack.
@@ -80,24 +76,3 @@ class NetworkFilter:
         share = motion_residuals(T[None], source, target)[0] / threshold
         weights = (share < 1) / (1 + share.square())
         return weights, 1 - share
-
-
-def network_filter(kind: str, weights: str | Path | None) -> Filter:
-    """The filter of a baseline's name.
-
-    Args:
-        kind: as in `NetworkConfig.kind`.
-        weights: a .safetensors file with its card beside it.
-
-    Raises:
-        CheckpointError: none given, not found, broken, or of another network.
-    """
-    if weights is None:
-        raise CheckpointError(
-            f"no weights of '{kind}' ship with this version; train it with configs/train/paper/{kind}.yaml "
-            "and give the file"
-        )
-    model, _ = load_network(weights)
-    if model.config.kind != kind:
-        raise CheckpointError(f"'{weights}' holds weights of '{model.config.kind}', not of '{kind}'")
-    return NetworkFilter(model)

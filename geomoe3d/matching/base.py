@@ -1,0 +1,38 @@
+"""What a matcher is: from the features of two clouds to putative correspondences.
+
+Place: match, between features and outlier rejection.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+from geomoe3d.parts import Part, Registry
+from geomoe3d.types import Correspondences, PreparedCloud
+
+
+class Matcher(Part):
+    """Pairs points of two clouds whose features are alike; wrong pairs are expected."""
+
+    @abstractmethod
+    def __call__(
+        self,
+        source: PreparedCloud,
+        target: PreparedCloud,
+        *,
+        limit: int,
+        seed: int = 0,
+        with_ratio: bool = False,
+    ) -> Correspondences:
+        """At most ``limit`` correspondences; `Correspondences.between` makes them from rows of points.
+
+        Args:
+            source, target: clouds with features, each in its local coordinates.
+            limit: most correspondences.
+            seed: decides every random choice.
+            with_ratio: whether the attribute ``ratio`` is asked for.
+        """
+
+
+matcher: Registry[Matcher] = Registry("matcher", "geomoe3d.matching", lambda: Matcher)
+"""Decorator by which a matcher joins, and the choice by name."""

@@ -1,0 +1,213 @@
+"""The parts that a configuration names, made once, and the steps from clouds to hypotheses that they take."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.clouds.pair import Pair
+from geomoe3d.clouds.prepare import prepare
+from geomoe3d.config import RegistrationConfig, ScoringConfig
+from geomoe3d.errors import ConfigError, EmptyCloudError
+from geomoe3d.estimators.base import Estimator, estimator
+from geomoe3d.estimators.proposals import propose
+from geomoe3d.features.base import Descriptor, descriptor, with_features, with_normals_flipped
+from geomoe3d.features.cache import FeatureCache, feature_identity
+from geomoe3d.filters.base import OutlierFilter, outlier_filter
+from geomoe3d.matching.base import Matcher, matcher
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, judges_transforms, packaged_names
+from geomoe3d.parts import Part
+from geomoe3d.refinement.base import Refiner, refiner
+from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.base import Scorer, make_scorers
+from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud, PreparedCloud
+
+_LINE = ("geomoe3d.registration", "geomoe3d.correspondence_registration")
+
+
+Clouds = tuple[PreparedCloud, PreparedCloud]
+Places = tuple[FloatArray, FloatArray] | None
+
+
+class Pipeline:
+    """One part of every kind, and the steps that lead from clouds to hypotheses.
+
+    Args:
+        config: complete and resolved.
+        cache: keeps features of clouds that are in many pairs; answers are the same without it.
+
+    Attributes:
+        descriptor, matcher, estimator, refiner: see their kinds.
+        filter: outlier rejection, or None without any.
+        scorers: by name, in the order in which they are asked.
+
+    Raises:
+        ConfigError: an unknown part, or settings that it does not take.
+        CheckpointError: trained weights are missing, broken or do not fit.
+        DependencyError: a library that a part needs is not installed.
+    """
+
+    def __init__(self, config: RegistrationConfig, cache: FeatureCache | None = None) -> None:
+        self.config, self._cache = config, cache
+        self.descriptor: Descriptor = descriptor.make(config.descriptor)
+        self.matcher: Matcher = matcher.make(config.matching)
+        _check_weights_are_wanted(config)
+        wanted = config.filter.name != "none"
+        self.filter: OutlierFilter | None = outlier_filter.make(config.filter) if wanted else None
+        self.estimator: Estimator = estimator.make(config.estimator)
+        self.scorers: dict[str, Scorer] = make_scorers(config.scoring)
+        self.refiner: Refiner = refiner.make(config.refinement)
+
+    def prepare(
+        self, cloud: PointCloud, voxel_size: float, viewpoint: FloatArray | None, clock: StageClock
+    ) -> PreparedCloud:
+        """One cloud on the grid, with normals and features, or as the cache holds it."""
+        config, seed, describe = self.config.preparation, self.config.seed, self.descriptor
+
+        def make() -> PreparedCloud:
+            clock("prepare")
+            made = prepare(cloud, voxel_size, config, viewpoint=viewpoint, seed=seed)
+            clock("features")
+            return with_features(made, describe)
+
+        if self._cache is None:
+            return make()
+        return self._cache.fetch(cloud, feature_identity(voxel_size, viewpoint, config, describe, seed), make)
+
+    def match(self, clouds: Clouds, places: Places, clock: StageClock, limit: int | None = None) -> Pair:
+        """Putative correspondences; at most ``limit``, None takes what the configuration says."""
+        clock("match")
+        needs = frozenset() if self.filter is None else self.filter.needs
+        matched = self.matcher(
+            *clouds,
+            limit=limit or self.config.matching.max_correspondences,
+            seed=self.config.seed,
+            with_ratio="ratio" in needs,
+        )
+        return self.pair(clouds, matched, places)
+
+    def pair(self, clouds: Clouds, matched: Correspondences, places: Places) -> Pair:
+        """Both clouds and what is matched between them, with the threshold of this grid."""
+        voxel_size = clouds[0].voxel_size
+        threshold = self.config.estimator.inlier_threshold * voxel_size
+        return Pair(replace(matched, viewpoints=places), voxel_size, threshold, self.config.seed, *clouds)
+
+    def weigh(self, pair: Pair) -> FilterOutput:
+        """What the outlier filter says of the correspondences; all ones without one."""
+        if self.filter is None:
+            return FilterOutput(np.ones(len(pair.matched)))
+        return self.filter(pair.matched, voxel_size=pair.voxel_size, seed=pair.seed)
+
+    def propose(self, pair: Pair, clock: StageClock) -> tuple[FilterOutput, list[Hypothesis]]:
+        """What the outlier filter, if there is one, says of the correspondences, and the hypotheses."""
+        if self.filter is not None:
+            clock("filter")
+        weighed = self.weigh(pair)
+        clock("propose")
+        return weighed, propose(self.estimator, pair, weighed.weights, self.config.estimator)
+
+    def flipped(self, clouds: Clouds, clock: StageClock) -> Clouds:
+        """Both clouds with the normals of the first turned over, and without sensors."""
+        clock("features")
+        source = with_normals_flipped(clouds[0], self.descriptor)
+        return source, replace(clouds[1], viewpoint=None)
+
+    def further_pairs(
+        self, pair: Pair, prepared: Clouds, places: Places, clock: StageClock, flipped: bool
+    ) -> Iterator[Pair]:
+        """The same scans for a second look: more matches of their grid, where there are more, and coarser grids."""
+        usual, most = self.config.matching.max_correspondences, self.config.second_look.max_correspondences
+        if len(pair.matched) >= usual and most > usual:
+            yield self.match(pair.clouds, places, clock, most)
+        for factor in self.config.second_look.grids:
+            size = factor * pair.voxel_size
+            bare = [PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in prepared]
+            try:
+                coarse = (
+                    self.prepare(bare[0], size, prepared[0].viewpoint, clock),
+                    self.prepare(bare[1], size, prepared[1].viewpoint, clock),
+                )
+            except EmptyCloudError:  # a cloud is too small for this grid
+                continue
+            yield self.match(self.flipped(coarse, clock) if flipped else coarse, places, clock)
+
+    def warm_up(self) -> None:
+        """Load weights now, and say now what is wrong with them."""
+        for part in self._parts().values():
+            part.warm_up()
+
+    def identity(self) -> dict[str, Any]:
+        """What decides an answer beside the configuration: code of the line, every part's own identity, and
+        versions of the libraries that they use. Nothing heavy is loaded for it."""
+        parts = self._parts()
+        modules = {*_LINE, *(type(part).__module__ for part in parts.values())}
+        return {
+            "code": {module: source_hash(module) for module in _LINE},
+            "parts": {kind: part.identity() for kind, part in parts.items()},
+            "versions": dict(library_versions(frozenset().union(*map(source_closure, modules)))),
+        }
+
+    def _parts(self) -> dict[str, Part]:
+        one = {"descriptor": self.descriptor, "matcher": self.matcher, "filter": self.filter}
+        rest = {"estimator": self.estimator, **self.scorers, "refiner": self.refiner}
+        return {kind: part for kind, part in {**one, **rest}.items() if part is not None}
+
+
+def resolved(config: RegistrationConfig | None) -> RegistrationConfig:
+    """The configuration, None for the defaults, with ``auto`` replaced by what it means on this machine.
+
+    Raises:
+        ConfigError: something else than a configuration.
+    """
+    config = RegistrationConfig() if config is None else config
+    if not isinstance(config, RegistrationConfig):
+        raise ConfigError(
+            f"config is a {type(config).__name__}, expected a RegistrationConfig; load_config(path, "
+            f"['key=value', ...]) makes one"
+        )
+    return config.model_copy(update={"scoring": _resolved_scoring(config.scoring)})
+
+
+def with_weights(config: RegistrationConfig, name_or_path: str) -> RegistrationConfig:
+    """The configuration with trained weights in the place where they belong, as their card says.
+
+    A network that judges transforms becomes the scorer, one that weighs correspondences the outlier filter.
+
+    Raises:
+        CheckpointError: no such weights.
+        ConfigError: a filter is named that takes none.
+    """
+    named = config.filter.model_copy(update={"weights": str(name_or_path)})
+    if named.name != "none":
+        _check_weights_are_wanted(config.model_copy(update={"filter": named}))
+    if judges_transforms(name_or_path):
+        scoring = config.scoring.model_copy(
+            update={"scorers": ("surfaces", "network"), "weights": str(name_or_path)}
+        )
+        return config.model_copy(update={"scoring": scoring})
+    if named.name == "none":
+        named = named.model_copy(update={"name": "geomoe"})
+    scoring = config.scoring
+    if scoring.scorers == "auto":
+        scoring = scoring.model_copy(update={"scorers": ("surfaces",)})
+    return config.model_copy(update={"filter": named, "scoring": scoring})
+
+
+def _check_weights_are_wanted(config: RegistrationConfig) -> None:
+    name, weights = config.filter.name, config.filter.weights
+    if weights is not None and not outlier_filter.find(name).takes_weights:
+        raise ConfigError(f"weights '{weights}' are given, but the filter '{name}' takes none")
+
+
+def _resolved_scoring(config: ScoringConfig) -> ScoringConfig:
+    """The network is taken where weights are given, and where its libraries are installed and weights ship."""
+    if config.scorers != "auto":
+        return config
+    installed = all(importlib.util.find_spec(name) is not None for name in ("torch", "safetensors"))
+    usable = config.weights is not None or (installed and DEFAULT_WEIGHTS in packaged_names())
+    return config.model_copy(update={"scorers": ("surfaces", "network") if usable else ("surfaces",)})

@@ -173,7 +173,14 @@ def judge(
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
     alone = confidence_score(evidence, UNRIVALLED_LEAD, support, information)
-    close = lead < 1 / config.ambiguity_ratio or _hardly_told_apart(answer, rival, config.ambiguity_ratio)
+    # What the clouds like alike is ambiguous unless the network makes the answer sure: by how much it prefers one
+    # hangs on which correspondences it saw.
+    alike = (
+        rival is not None
+        and evidence_of(rival).surface_score >= config.ambiguity_ratio * evidence.surface_score
+    )
+    unsure = confidence < config.min_confidence or _hardly_told_apart(answer, rival)
+    close = lead < 1 / config.ambiguity_ratio or (alike and unsure)
     if close and alone >= _LIKELY:
         notes.append(
             f"a clearly different transform does {min(100 / lead, 100):.0f} % as well; see the alternative, "
@@ -189,13 +196,10 @@ def judge(
     return Judgement("ok", tuple(notes), confidence)
 
 
-def _hardly_told_apart(answer: Hypothesis, rival: Hypothesis | None, ratio: float) -> bool:
-    """Whether the clouds like both about as well and the network's verdicts lie close together."""
+def _hardly_told_apart(answer: Hypothesis, rival: Hypothesis | None) -> bool:
+    """Whether the network's verdicts on both lie close together."""
     said, other = opinion_of(answer), opinion_of(rival)
-    if rival is None or said is None or other is None:
-        return False
-    alike = evidence_of(rival).surface_score >= ratio * evidence_of(answer).surface_score
-    return alike and abs(said.verdict - other.verdict) < _CLOSE_VERDICTS
+    return said is not None and other is not None and abs(said.verdict - other.verdict) < _CLOSE_VERDICTS
 
 
 def lead_over(score: float, other: float | None) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.files import part_option
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
@@ -43,6 +44,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
 @click.option("--no-cache", is_flag=True, help="Cache no features: compute them anew for every pair.")
 @click.option("--quiet", is_flag=True, help="No progress and no table.")
+@part_option("reader")
 @traceback_option
 @click.pass_context
 def command(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.files import part_option
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ _SHOWN = 20
 @click.option("--fresh", is_flag=True, help="Delete the earlier model in OUT first.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@part_option("reader")
 @traceback_option
 @click.pass_context
 def command(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import part_options
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ class _Outputs:
     default="auto",
     help="Coordinates of PLY and PCD: auto, double, or single (floats about an origin). [auto]",
 )
+@part_option("reader")
+@part_option("writer")
 @click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
 @click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")

@@ -5,6 +5,7 @@
 format allows. The work is done in `loading`, `saving` and one module per format family under `formats`.
 """
 
+from geomoe3d.clouds.formats.registry import use_part
 from geomoe3d.clouds.loading import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.saving import (
     WRITABLE_MESH_SUFFIXES,
@@ -24,4 +25,5 @@ __all__ = [
     "load_points",
     "save_aligned",
     "save_points",
+    "use_part",
 ]

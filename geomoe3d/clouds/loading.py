@@ -33,7 +33,7 @@ from geomoe3d.clouds.formats import (  # noqa: F401  each registers its readers 
     vtk,
 )
 from geomoe3d.clouds.formats.raw import RawCloud
-from geomoe3d.clouds.formats.registry import READERS
+from geomoe3d.clouds.formats.registry import READERS, take_inherited
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, NonFiniteError
 from geomoe3d.geometry.columns import finite_rows
@@ -196,6 +196,7 @@ def read_raw(data: Any) -> RawCloud:
     if not _is_path(data):
         return objects.raw_from_object(data)
     path = Path(data)
+    take_inherited()
     try:
         if path.is_dir():
             raise InputError(f"'{path}' is a directory; pass one file of it")
@@ -203,7 +204,7 @@ def read_raw(data: Any) -> RawCloud:
         inner = path.with_suffix("") if path.suffix.lower() == ".gz" else path
         reader = READERS.get(inner.suffix.lower())
         if reader is None:
-            raise FormatError(unknown_suffix(inner, READABLE_SUFFIXES, "readable"))
+            raise FormatError(unknown_suffix(inner, tuple(READERS), "readable"))
         if size == 0:
             raise EmptyCloudError(f"'{path}' is an empty file (0 bytes)")
         with np.errstate(all="ignore"):  # files hold all kinds of numbers; what is not finite is dropped

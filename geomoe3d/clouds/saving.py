@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.formats import e57, gltf, las, meshes
 from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.formats.raw import RawCloud
-from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS
+from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS, take_inherited
 from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.errors import FormatError, InputError, NonFiniteError
@@ -90,7 +90,8 @@ def save_points(
         FormatError: an unknown suffix, or normals or colours for NPY, which cannot name them.
         OutputError: as `check_cloud_output`, or the disk refuses.
     """
-    path = check_cloud_output(path, force, WRITABLE_SUFFIXES)
+    take_inherited()
+    path = check_cloud_output(path, force, tuple(CLOUD_WRITERS))
     cloud = RawCloud(
         points_array(points),
         None if normals is None else points_array(normals, "the normals"),
@@ -127,7 +128,8 @@ def check_aligned(
         DependencyError: what the format needs is not installed.
         OutputError, InputError: as `save_aligned`.
     """
-    both = tuple(dict.fromkeys(WRITABLE_SUFFIXES + WRITABLE_MESH_SUFFIXES))
+    take_inherited()
+    both = tuple(dict.fromkeys((*CLOUD_WRITERS, *MESH_WRITERS, ".glb")))
     path = check_cloud_output(path, force, both)
     suffix = path.suffix.lower()
     if precision not in PRECISIONS:
@@ -141,10 +143,10 @@ def check_aligned(
         las.require_laspy(suffix == ".laz")
     if suffix == ".e57":
         e57.require_pye57()
-    if suffix not in WRITABLE_SUFFIXES and read_raw(source).faces is None:
+    if suffix not in CLOUD_WRITERS and read_raw(source).faces is None:
         raise FormatError(
             f"'{path}': {suffix} holds meshes, but {describe(source)} is a cloud; writable: "
-            + ", ".join(WRITABLE_SUFFIXES)
+            + ", ".join(CLOUD_WRITERS)
         )
     return path
 
@@ -211,7 +213,7 @@ def _save_aligned(
         return ()
     what = describe(source)
     raw, _ = finite_part(read_raw(source), what)
-    as_mesh = raw.faces is not None and suffix in WRITABLE_MESH_SUFFIXES
+    as_mesh = raw.faces is not None and suffix in (*MESH_WRITERS, ".glb")
     lost = list(raw.unread)
     if not as_mesh and raw.faces is not None:
         sampled = is_sampled(source, raw)

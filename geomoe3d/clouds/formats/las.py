@@ -14,6 +14,7 @@ from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors,
 from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import DependencyError, FormatError
 
+_POINTS_PER_BYTE = 100  # far more than any compression gives, of points that differ
 _LARGEST = 2_000_000_000  # of the signed 32 bit integers that LAS stores, with a margin
 
 
@@ -118,6 +119,11 @@ def _check_size(path: Path, header: Any) -> None:
     """Hold the header against the file's size, which laspy does not."""
     size = path.stat().st_size
     if header.are_points_compressed:
+        if header.point_count > _POINTS_PER_BYTE * size:
+            raise FormatError(
+                f"'{path}': the header says {header.point_count} points, {size} bytes cannot hold them; its "
+                "header is wrong"
+            )
         _check_chunk_table(path, header, size)
         return
     held = (size - header.offset_to_point_data) // header.point_format.size

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from geomoe3d.errors import ConfigError
+from geomoe3d.errors import ConfigError, MissingConfigError
 
 S = TypeVar("S", bound="Section")
 
@@ -290,7 +290,8 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
+        kind = MissingConfigError if isinstance(error, FileNotFoundError) else ConfigError
+        raise kind(f"cannot read configuration '{path}': {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"'{path}' is not valid YAML: {error}") from None
     if tree is None:

@@ -1,5 +1,6 @@
 """Every error that geomoe3d raises on purpose.
 
+Each also derives from the builtin that fits, so ``except FileNotFoundError`` or ``except ValueError`` work as usual.
 A message says what is wrong, the value that was found, the limit it broke and what to do about it.
 Anything else that escapes is a fault of the library. The command line turns the classes here into exit
 code 2 (the input is at fault) and everything else into 1.
@@ -14,6 +15,14 @@ class GeoMoE3DError(Exception):
 
 class InputError(GeoMoE3DError, ValueError):
     """The given data cannot be used: missing, malformed, too small or degenerate."""
+
+
+class MissingFileError(InputError, FileNotFoundError):
+    """There is no such file or folder to read."""
+
+
+class ForbiddenFileError(InputError, PermissionError):
+    """A file or folder may not be read."""
 
 
 class FormatError(InputError):
@@ -32,13 +41,32 @@ class OutputError(GeoMoE3DError, OSError):
     """A result cannot be written: the file exists, the folder is missing or the disk refuses."""
 
 
+class ExistingFileError(OutputError, FileExistsError):
+    """A file is there already, and it was not said that it may be replaced."""
+
+
 class ConfigError(GeoMoE3DError, ValueError):
     """A configuration key or value is not valid; the message names the nearest valid key."""
+
+
+class MissingConfigError(ConfigError, FileNotFoundError):
+    """There is no such configuration file."""
 
 
 class CheckpointError(GeoMoE3DError, ValueError):
     """Weights or a checkpoint do not fit: wrong architecture, broken hash, foreign format."""
 
 
+class MissingWeightsError(CheckpointError, FileNotFoundError):
+    """There are no such weights, or no such checkpoint."""
+
+
 class DependencyError(GeoMoE3DError, ImportError):
     """An optional part is not installed; the message gives the command that installs it."""
+
+
+def cannot_read(error: OSError, message: str) -> InputError:
+    """The class of `InputError` for what the system says: missing, forbidden or anything else."""
+    if isinstance(error, FileNotFoundError):
+        return MissingFileError(message)
+    return (ForbiddenFileError if isinstance(error, PermissionError) else InputError)(message)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.decision.selection import Selection
-from geomoe3d.errors import ConfigError
+from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.features.cache import FeatureCache
 from geomoe3d.pipeline import Clouds, Pipeline, Places, resolved, with_weights
 from geomoe3d.result import RegistrationResult
@@ -80,13 +80,38 @@ class Registrar:
         given: dict[str, Any] = {"initial": initial, "correspondences": correspondences}
         return self.explain(source, target, **given, progress=progress).result
 
-    def register_many(self, pairs: Iterable[tuple[Any, Any]]) -> Iterator[RegistrationResult]:
+    @overload
+    def register_many(self, pairs: Iterable[tuple[Any, Any]]) -> Iterator[RegistrationResult]: ...
+    @overload
+    def register_many(
+        self, pairs: Iterable[tuple[Any, Any]], *, on_error: Literal["raise"]
+    ) -> Iterator[RegistrationResult]: ...
+    @overload
+    def register_many(
+        self, pairs: Iterable[tuple[Any, Any]], *, on_error: Literal["return"]
+    ) -> Iterator[RegistrationResult | InputError]: ...
+    def register_many(
+        self, pairs: Iterable[tuple[Any, Any]], *, on_error: Literal["raise", "return"] = "raise"
+    ) -> Iterator[RegistrationResult | InputError]:
         """One result per (source, target), in order, as they are finished.
 
-        A cloud that cannot be used raises as in `register` and ends it; `geomoe3d.register_pairs` goes on.
+        Args:
+            pairs: of anything that `register` takes.
+            on_error: what becomes of a pair with a cloud that cannot be used: ``raise`` ends it as `register`
+                does, ``return`` gives the error in place of the result and goes on.
+
+        Raises:
+            InputError: as `register`, with ``raise``; or another word for ``on_error``.
         """
+        if on_error not in ("raise", "return"):
+            raise InputError(f"on_error is '{on_error}'; choose raise or return")
         for source, target in pairs:
-            yield self.register(source, target)
+            try:
+                yield self.register(source, target)
+            except InputError as error:
+                if on_error == "raise":
+                    raise
+                yield error
 
     def filter(self, correspondences: ArrayLike, *, voxel_size: float) -> FloatArray:
         """Weights (N,) in [0, 1] for anybody's correspondences (N, 6) = [source xyz, target xyz].
@@ -127,7 +152,8 @@ class Registrar:
             check_cloud(cloud)
         mismatch = scale_mismatch(*clouds)
         if mismatch is not None:
-            return Explanation(failed_result(clouds, mismatch, config, clock.stop()), *clouds)
+            failed = failed_result(clouds, mismatch, config, clock.stop())
+            return Explanation(failed, *clouds).remembering(source, target)
         clock("prepare")
         wanted = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
@@ -153,7 +179,8 @@ class Registrar:
             weighed = said or FilterOutput(np.zeros(len(pair.matched)))
         result = finished_result(pair, decision, config, clock.stop())
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
-        return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
+        found = Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
+        return found.remembering(source, target)
 
     def _look(
         self,

@@ -1,16 +1,23 @@
-"""What a registration returns: the transform, how sure it is, and where it came from."""
+"""What a registration returns: the transform, how sure it is, and where it came from.
+
+A result fresh from `register` also remembers what it was made of (`geomoe3d.clouds.inputs`), for pictures.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from geomoe3d.clouds.inputs import NOT_KEPT, Inputs
 from geomoe3d.errors import InputError
-from geomoe3d.types import FloatArray
+from geomoe3d.types import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from geomoe3d.visual.view import RegistrationView
 
 Status = Literal["ok", "low_confidence", "ambiguous", "failed"]
 
@@ -57,7 +64,7 @@ class Alternative:
     translation_difference: float
 
 
-@dataclass(frozen=True, eq=False)  # arrays have no single truth value: compare what matters
+@dataclass(frozen=True, eq=False, repr=False)  # arrays have no single truth value: compare what matters
 class RegistrationResult:
     """The answer to "which rigid motion lays source on target?", with its own judgement.
 
@@ -110,33 +117,182 @@ class RegistrationResult:
     versions: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
 
+    _inputs: ClassVar[Inputs | None] = None  # no field: it is neither compared nor part of the JSON
+
     @property
     def ok(self) -> bool:
         """True only for status ok."""
         return self.status == "ok"
 
-    def apply(self, points: ArrayLike) -> FloatArray:
-        """Move source points (N, 3), file coordinates, into the target's file coordinates.
+    @property
+    def has_transform(self) -> bool:
+        """Whether there is a transform at all, right or not; False where everything failed."""
+        return bool(np.isfinite(self.T_target_source).all())
+
+    @property
+    def correspondences(self) -> FloatArray:
+        """(K, 6) rows [source xyz, target xyz] given to the estimator, in the files' coordinates.
 
         Raises:
-            InputError: the array is not (N, 3), or the result holds no transform.
+            InputError: the result does not hold them, as one read from JSON.
         """
-        from geomoe3d.geometry.se3 import transform_points
+        if self._inputs is None:
+            raise InputError(NOT_KEPT.format(what="its correspondences"))
+        return self._inputs.correspondences
 
-        if not np.isfinite(self.T_target_source).all():
+    @property
+    def inliers(self) -> BoolArray:
+        """(K,) True where a correspondence agrees with the transform; all False without one."""
+        from geomoe3d.geometry.se3 import residuals
+
+        rows = self.correspondences
+        return residuals(self.T_target_source, rows[:, :3], rows[:, 3:]) < self.inlier_threshold
+
+    def apply(self, points: Any) -> Any:
+        """Move source points, file coordinates, into the target's file coordinates.
+
+        Args:
+            points: (N, 3) array; tensor; Open3D or trimesh cloud or mesh; or `PointCloud`.
+
+        Returns:
+            The same kind of object, moved (an array is float64); what was given stays as it is.
+
+        Raises:
+            InputError: nothing that holds points (N, 3), or the result holds no transform.
+        """
+        from geomoe3d.clouds.moved import moved
+
+        return moved(points, self._transform())
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the result in any format of ``geomoe3d register --output``.
+
+        Args:
+            path: .json holds the whole result; .txt, .npy, .yaml, .tum and .kitti the transform, and so does a
+                name in front of the path: ``pdal:FILE``, ``ros:FILE``, ``quaternion:FILE``, ...
+            force: replace an existing file.
+
+        Raises:
+            FormatError: no such format.
+            InputError: the result holds no transform, and the format asks for one.
+            OutputError: the file exists and ``force`` is False, or it cannot be written.
+        """
+        from geomoe3d.clouds.transform_files import save_result, transform_format
+
+        if transform_format(path)[0] != "json":
+            self._transform()
+        comments = [
+            f"maps {self.source.name} into {self.target.name}: p_target = R p_source + t",
+            f"status {self.status}, confidence {self.confidence:.4f}",
+        ]
+        save_result(path, self, comments, force=force)
+
+    def save_aligned(
+        self, path: str | os.PathLike[str], source: Any = None, *, force: bool = False
+    ) -> tuple[str, ...]:
+        """Write the source at full resolution, moved into the target's coordinates (``register --aligned``).
+
+        Args:
+            path: any suffix of `geomoe3d.save_points`, or of a mesh where the source is one.
+            source: None takes the source that was registered.
+            force: replace an existing file.
+
+        Returns:
+            What the source says of its points and the format cannot hold, by name.
+
+        Raises:
+            InputError: the result holds no transform, or no source and none is given.
+            FormatError, OutputError: as `save`.
+        """
+        from geomoe3d.clouds.saving import save_aligned
+
+        data = source if source is not None or self._inputs is None else self._inputs.source
+        if data is None:
+            raise InputError(NOT_KEPT.format(what="the source"))
+        return save_aligned(path, data, self._transform(), force=force)
+
+    def picture(
+        self, path: str | os.PathLike[str], *, source: Any = None, target: Any = None, force: bool = False
+    ) -> None:
+        """Draw before, after, correspondences and residuals into one picture (``register --picture``).
+
+        Args:
+            path: .png, .pdf, .svg, .jpg or .webp.
+            source, target: None takes what was registered, loaded again.
+            force: replace an existing file.
+
+        Raises:
+            InputError: a cloud is neither remembered nor given, or has changed since.
+            FormatError, OutputError: as `save`.
+        """
+        from geomoe3d.visual.picture import save_picture
+
+        save_picture(self._view(source, target), path, force=force)
+
+    def page(
+        self, path: str | os.PathLike[str], *, source: Any = None, target: Any = None, force: bool = False
+    ) -> None:
+        """Write a page in which the clouds can be turned (``register --page``); arguments as `picture`.
+
+        Raises:
+            InputError, OutputError: as `picture`.
+        """
+        from geomoe3d.visual.page import save_page
+
+        save_page(self._view(source, target), path, force=force)
+
+    def __repr__(self) -> str:
+        return f"<RegistrationResult {self._words()}>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the words, and the clouds to turn where they are still at hand."""
+        from geomoe3d.visual.notebook import notebook_html
+
+        try:
+            view = self._view(None, None)
+        except (InputError, OSError):
+            view = None
+        return notebook_html(self.status, self._words(), view)
+
+    def _words(self) -> str:
+        """The answer in one paragraph."""
+        words = f"{self.status}, confidence {self.confidence:.2f}"
+        names = f"'{self.source.name}' into '{self.target.name}'"
+        if not self.has_transform:
+            return "; ".join([f"{words}: no transform that maps {names} was found", *self.reasons])
+        from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, transform_points
+
+        words += f": maps {names}, turned by {rotation_angle_deg(self.T_target_source[:3, :3]):.1f} degrees"
+        center = self.information_center[None]
+        if np.isfinite(center).all():
+            step = np.linalg.norm(center - transform_points(inverse(self.T_target_source), center))
+            words += f" and shifted by {step:.3g}"
+        words += (
+            f"; {self.overlap:.0%} of the source lies on the target, {self.num_inliers:,} of "
+            f"{self.num_correspondences:,} correspondences agree within {self.inlier_threshold:.3g}"
+        )
+        return "; ".join([words, *self.reasons])
+
+    def _transform(self) -> FloatArray:
+        if not self.has_transform:
             raise InputError(
                 f"this result holds no transform (status {self.status}: {'; '.join(self.reasons)})"
             )
-        try:
-            array = np.asarray(points, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"points must be numbers of shape (N, 3), found a {type(points).__name__}; "
-                "geomoe3d.load_points(...).file_points gives those of a file or an object"
-            ) from None
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise InputError(f"points must have shape (N, 3), found {array.shape}")
-        return transform_points(self.T_target_source, array)
+        return self.T_target_source
+
+    def _view(self, source: Any, target: Any) -> RegistrationView:
+        from geomoe3d.visual.view import RegistrationView
+
+        kept = self._inputs or Inputs(None, None)
+        clouds = kept.clouds(source, target, self.seed)
+        found = kept.correspondences, kept.weights, kept.groups, kept.group_names
+        return RegistrationView.of(self, clouds, *found)
+
+    def _with_inputs(self, inputs: Inputs) -> RegistrationResult:
+        """The same result, which knows what it was made of."""
+        copy = replace(self)
+        object.__setattr__(copy, "_inputs", inputs)
+        return copy
 
     def inverse(self) -> RegistrationResult:
         """The same answer with the roles of source and target exchanged.
@@ -147,8 +303,8 @@ class RegistrationResult:
         """
         from geomoe3d.geometry.se3 import inverse, transform_points
 
-        if not np.isfinite(self.T_target_source).all():
-            return replace(self, source=self.target, target=self.source)
+        if not self.has_transform:
+            return self._exchanged(replace(self, source=self.target, target=self.source))
         T = inverse(self.T_target_source)
         # A left perturbation xi of T about c equals the perturbation -Ad(xi) of T^-1 about T^-1 c.
         A = np.zeros((6, 6))
@@ -156,7 +312,7 @@ class RegistrationResult:
         other = self.alternative
         if other is not None:
             other = replace(other, T_target_source=inverse(other.T_target_source))
-        return replace(
+        answer = replace(
             self,
             T_target_source=T,
             alternative=other,
@@ -165,6 +321,10 @@ class RegistrationResult:
             source=self.target,
             target=self.source,
         )
+        return self._exchanged(answer)
+
+    def _exchanged(self, other: RegistrationResult) -> RegistrationResult:
+        return other if self._inputs is None else other._with_inputs(self._inputs.exchanged())
 
     def to_json(self, indent: int | None = 2) -> str:
         """JSON text; floats keep every bit, missing numbers are null."""

@@ -25,6 +25,7 @@ from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.features.cache import CACHE_VARIABLE
 from geomoe3d.pipeline import resolved
+from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 ALL_THAT_FIT = 0
@@ -50,6 +51,20 @@ class BatchReport:
     def ok(self) -> bool:
         """True where every pair is sure."""
         return all(outcome.status == "ok" for outcome in self.outcomes)
+
+    def table(self) -> Any:
+        """A row per pair, in the order given: id, status, confidence, overlap, the transform, reasons.
+
+        Returns:
+            A pandas DataFrame where pandas is installed, else a list of dictionaries; NaN and None where a pair
+            could not be registered, whose error then stands among the reasons.
+        """
+        rows = [outcome.row() for outcome in self.outcomes]
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            return rows
+        return DataFrame(rows)
 
     def counts(self) -> dict[str, int]:
         """Number of pairs by status, the frequent first."""
@@ -128,6 +143,7 @@ def try_out(pool: Pool, settings: Settings) -> None:
         ) from None
 
 
+@shows_progress("pairs")
 def register_pairs(
     pairs: str | os.PathLike[str] | Iterable[PairLike | PairRow],
     out: str | os.PathLike[str],
@@ -140,7 +156,7 @@ def register_pairs(
     fresh: bool = False,
     retry: bool = False,
     cache: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Watch = None,
     say: Callable[[str], None] | None = None,
 ) -> BatchReport:
     """Register many pairs into a folder, where an interrupted batch is gone on with.
@@ -161,7 +177,8 @@ def register_pairs(
         fresh: forget what the folder holds of an earlier batch; not before all that can be refused is known.
         retry: do the pairs again that could not be registered.
         cache: folder of described clouds; None: the user's own; "": none.
-        progress: called with (pairs done, pairs in all).
+        progress: called with (pairs done, pairs in all); None shows a bar when it takes long, False
+            shows nothing.
         say: called with a sentence on workers and memory before the work begins.
 
     Raises:
@@ -178,7 +195,7 @@ def register_pairs(
     labour.check()
     store = BatchStore(folder, config, fresh=fresh)
     check_extras(folder, [row.id for row in rows], transforms=transforms, page=page)
-    records, kept = work(rows, store, config, labour, retry, progress, say)
+    records, kept = work(rows, store, config, labour, retry, progress or None, say)
     outcomes = tuple(store.outcome(records[row.id]) for row in rows)
     store.write_results(records[row.id] for row in rows)
     if transforms:

@@ -66,6 +66,18 @@ class Outcome:
         """That of the result, or 0."""
         return 0.0 if self.result is None else self.result.confidence
 
+    def row(self) -> dict[str, Any]:
+        """The columns of `geomoe3d.batch.run.BatchReport.table`."""
+        found = self.result
+        return {
+            "id": self.id,
+            "status": self.status,
+            "confidence": self.confidence,
+            "overlap": float("nan") if found is None else found.overlap,
+            "T_target_source": None if found is None else found.T_target_source,
+            "reasons": self.error if found is None else "; ".join(found.reasons),
+        }
+
 
 class BatchStore:
     """The folder of one batch; looked at when made, written from `begin` on.

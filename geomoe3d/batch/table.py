@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.transform_files import load_transform
-from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, cannot_read
 from geomoe3d.geometry.se3 import check_motion
 from geomoe3d.types import FloatArray
 
@@ -81,7 +81,7 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
     except UnicodeDecodeError:
         raise FormatError(f"'{path}' is no text in UTF-8; save the table as CSV") from None
     except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror}") from None
     head = text.partition("\n")[0]
     separator = max(",;\t", key=head.count)
     reader = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True)

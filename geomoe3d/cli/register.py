@@ -132,10 +132,9 @@ def command(
     finally:  # a full disk must not cost the answer
         _print(result.inverse() if inverse else result, as_json, quiet, inverse)
     if show and explanation is not None:
-        from geomoe3d.visual.explained import explained_view
         from geomoe3d.visual.window import show_window
 
-        show_window(explained_view(explanation))
+        show_window(explanation.view())
     context.exit(0 if result.ok else NOT_SURE)
 
 
@@ -224,9 +223,7 @@ def _write(
         else:
             skipped.append(outputs.aligned)
     if explanation is not None and (outputs.picture is not None or outputs.page is not None):
-        from geomoe3d.visual.explained import explained_view
-
-        view = explained_view(explanation)
+        view = explanation.view()
         if outputs.picture is not None:
             stage("draw the picture")
             from geomoe3d.visual.picture import save_picture

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geomoe3d.errors import FormatError
+from geomoe3d.errors import FormatError, cannot_read
 from geomoe3d.types import FloatArray
 
 
@@ -14,7 +14,8 @@ def load_correspondences(path: str | Path) -> FloatArray:
     """(N, 6) rows [source xyz, target xyz] of an .npy file, or of text with blanks or commas between numbers.
 
     Raises:
-        FormatError: missing, unreadable, or another number of columns than six.
+        InputError: missing or unreadable.
+        FormatError: another number of columns than six.
     """
     place = Path(path)
     try:
@@ -25,7 +26,7 @@ def load_correspondences(path: str | Path) -> FloatArray:
             rows = np.loadtxt(text.splitlines(), ndmin=2)
         found: FloatArray = np.asarray(rows, dtype=np.float64)
     except OSError as error:
-        raise FormatError(f"cannot read '{path}': {error.strerror or error}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
     except ValueError as error:
         raise FormatError(f"'{path}' holds no rows of six numbers: {error}") from None
     if found.ndim != 2 or found.shape[1] != 6:

@@ -35,7 +35,14 @@ from geomoe3d.clouds.formats import (  # noqa: F401  each registers its readers 
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import READERS, take_inherited
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.errors import EmptyCloudError, FormatError, InputError, NonFiniteError
+from geomoe3d.errors import (
+    EmptyCloudError,
+    ForbiddenFileError,
+    FormatError,
+    InputError,
+    MissingFileError,
+    NonFiniteError,
+)
 from geomoe3d.geometry.columns import finite_rows
 from geomoe3d.runtime.home import ensure_home
 from geomoe3d.types import FloatArray, PointCloud
@@ -216,9 +223,11 @@ def read_raw(data: Any) -> RawCloud:
         if error.filename is not None and Path(error.filename) != path:
             raise FormatError(f"'{path}' refers to a missing file '{error.filename}'") from None
         here = "" if path.is_absolute() else f" (folder now: {Path.cwd()})"
-        raise InputError(f"there is no file '{path}'; check the path{here}") from None
+        raise MissingFileError(f"there is no file '{path}'; check the path{here}") from None
     except PermissionError:
-        raise InputError(f"'{path}' may not be read: permission denied; check its owner and mode") from None
+        raise ForbiddenFileError(
+            f"'{path}' may not be read: permission denied; check its owner and mode"
+        ) from None
     except OSError as error:
         raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
 

@@ -12,14 +12,17 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from geomoe3d.clouds.transform_formats import TEXTS, describe_error, matrix_text, of_matrix, parse_transform
-from geomoe3d.errors import FormatError, InputError
-from geomoe3d.result import RegistrationResult
+from geomoe3d.errors import FormatError, InputError, cannot_read
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.types import FloatArray
+
+if TYPE_CHECKING:
+    from geomoe3d.result import RegistrationResult
 
 TRANSFORM_FORMATS = (*TEXTS, "json", "npy")
 _BY_SUFFIX = {
@@ -164,7 +167,7 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
         else:
             T = parse_transform(data.decode("utf-8-sig", errors="replace"))
     except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
     except (ValueError, EOFError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise FormatError(f"'{path}' holds no transform: {describe_error(error)}") from None
     if T.shape != (4, 4):

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.result import RegistrationResult
 from geomoe3d.types import FloatArray
 
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -206,8 +205,9 @@ def _of_publisher(text: str) -> FloatArray:
 def _of_document(data: Any) -> FloatArray:
     """What JSON or YAML holds: a result, a PDAL pipeline, a transform or pose of ROS, or a matrix."""
     if isinstance(data, dict) and "T_target_source" in data:
-        T = RegistrationResult.from_json(json.dumps(data)).T_target_source if "status" in data else None
-        return np.array(data["T_target_source"], dtype=np.float64) if T is None else T
+        return np.array(
+            data["T_target_source"], dtype=np.float64
+        )  # of a failed result None, which becomes NaN
     found: list[FloatArray] = list(_motions(data))
     if len(found) != 1:
         raise FormatError(f"{len(found)} motions in it, expected one")

@@ -31,7 +31,7 @@ from geomoe3d.data.threedmatch import (
     read_gt_overlap,
     true_motion,
 )
-from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, MissingFileError
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
 from geomoe3d.types import FloatArray, PointCloud
 
@@ -123,7 +123,7 @@ def load_fragment(path: str | Path) -> PointCloud:
             with np.load(path, allow_pickle=False) as archive:
                 points = archive["pcd"] if "pcd" in archive.files else None
         except FileNotFoundError:
-            raise InputError(f"'{path}' does not exist") from None
+            raise MissingFileError(f"'{path}' does not exist") from None
         except Exception as error:  # zip, zlib, header: a damaged archive raises nearly anything
             raise FormatError(f"'{path}' cannot be read: {error}") from None
         if points is not None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import FormatError, InputError, MissingFileError, cannot_read
 from geomoe3d.geometry.se3 import is_rotation, make_transform, project_to_so3
 from geomoe3d.types import Float32Array, FloatArray
 
@@ -114,7 +114,7 @@ def read_depth(recording: Recording, frame: Frame) -> Float32Array:
         with Image.open(frame.path) as image:
             values = np.array(image)
     except FileNotFoundError:
-        raise InputError(f"'{frame.path}' does not exist") from None
+        raise MissingFileError(f"'{frame.path}' does not exist") from None
     except Exception as error:  # Pillow raises OSError, SyntaxError, ValueError and zlib's own
         raise FormatError(f"'{frame.path}' is no readable image: {error}") from None
     if values.ndim != 2 or values.dtype.kind not in "iu" or values.dtype.itemsize < 2:
@@ -168,7 +168,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise FormatError(f"'{path}' is no text file") from None
 

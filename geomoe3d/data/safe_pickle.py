@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import FormatError, cannot_read
 
 _ALLOWED = {
     ("numpy", "ndarray"): np.ndarray,
@@ -48,7 +48,7 @@ def load_pickle(path: str | Path) -> Any:
             _load(stream), _load(stream)  # protocol version, description of the machine
             return _load(stream)
     except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror or error}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
     except FormatError as error:
         raise FormatError(f"'{path}': {error}") from None
     except Exception as error:  # a damaged pickle raises nearly anything

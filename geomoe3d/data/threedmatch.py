@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import FormatError, InputError, cannot_read
 from geomoe3d.geometry.se3 import inverse, is_motion, make_transform, project_to_so3
 from geomoe3d.runtime.files import write_text
 from geomoe3d.types import FloatArray
@@ -290,7 +290,7 @@ def _lines(path: Path) -> list[str]:
     except UnicodeDecodeError:
         raise FormatError(f"'{path}' is no text file") from None
     except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror}") from None
 
 
 def _read_blocks(path: Path, size: int) -> PairTable:

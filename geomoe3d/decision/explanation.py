@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geomoe3d.clouds.inputs import Inputs, mark_of
 from geomoe3d.result import RegistrationResult
 from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud
+
+if TYPE_CHECKING:
+    from geomoe3d.visual.view import RegistrationView
 
 
 @dataclass(frozen=True)
@@ -36,3 +41,28 @@ class Explanation:
     def weights(self) -> FloatArray:
         """(K,) the filter's weights."""
         return self.weighed.weights
+
+    def view(self) -> RegistrationView:
+        """What the displays take: clouds, answer and correspondences in file coordinates."""
+        from geomoe3d.visual.view import RegistrationView
+
+        made = self._inputs(None, None)
+        found = made.correspondences, made.weights, made.groups, made.group_names
+        return RegistrationView.of(self.result, (self.source, self.target), *found)
+
+    def remembering(self, source: Any, target: Any) -> Explanation:
+        """With a result that knows what it was made of: the data as the caller gave them."""
+        return replace(self, result=self.result._with_inputs(self._inputs(source, target)))
+
+    def _inputs(self, source: Any, target: Any) -> Inputs:
+        matched, weighed, used = self.correspondences, self.weighed, self.result.config
+        filtered = used["filter"]["name"] != "none" or "network" in used["scoring"]["scorers"]
+        return Inputs(
+            source,
+            target,
+            (mark_of(self.source), mark_of(self.target)),
+            np.column_stack([matched.source + self.source.origin, matched.target + self.target.origin]),
+            weighed.weights if filtered else None,
+            weighed.groups,
+            weighed.group_names,
+        )

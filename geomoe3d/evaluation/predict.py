@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -38,6 +38,7 @@ from geomoe3d.evaluation.records import (
 from geomoe3d.evaluation.tracks import InputMaker, needs
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.journal import Journal
+from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.provenance import hardware, source_commit, usable_cores
 from geomoe3d.runtime.workers import Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.types import BoolArray, FloatArray
@@ -75,6 +76,7 @@ class PredictReport:
     absent: dict[str, str]
 
 
+@shows_progress("predictions")
 def predict(
     study: str | Path,
     methods: Sequence[MethodSpec],
@@ -83,7 +85,7 @@ def predict(
     workers: int = 1,
     fresh: bool = False,
     command: str = "",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Watch = None,
 ) -> PredictReport:
     """Predict what is missing of every method's run on one evaluation set.
 
@@ -94,7 +96,8 @@ def predict(
         workers: processes over pairs; times are only comparable between runs of as many.
         fresh: True removes the predictions of these runs first.
         command: for the record.
-        progress: called with (predictions there, predictions in all).
+        progress: called with (predictions there, predictions in all); None shows a bar when it takes long, False
+            shows nothing.
 
     Raises:
         InputError: no worker; an unknown method, benchmark or track; a method that cannot take the track's
@@ -133,7 +136,7 @@ def predict(
                     todo.setdefault(pair.id, []).append(number)
         jobs = [_Job(tuple(present), chosen, pair, tuple(todo[pair.id])) for pair in pairs if pair.id in todo]
         total, count = kept + sum(map(len, todo.values())), kept
-        if progress is not None:
+        if progress:
             progress(count, total)
         _bench.cache_clear()  # files of the user's may have changed since the last call
         pool = SerialPool() if workers == 1 else ProcessPool(workers, threads=_threads(workers))
@@ -141,7 +144,7 @@ def predict(
             for number, record in answers:
                 journals[number].append(record)
                 count += 1
-            if progress is not None:
+            if progress:
                 progress(count, total)
     return PredictReport(tuple(folders.values()), count - kept, kept, absent)
 

@@ -5,7 +5,6 @@ Reads the cache and the ground truth alone; no method runs. 1,887 predictions ta
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -19,6 +18,7 @@ from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 from geomoe3d.evaluation.report_text import run_key, to_json, to_markdown
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.progress import Watch, shows_progress
 
 REPORT_SUFFIXES = (".html", ".md", ".json")
 
@@ -40,15 +40,14 @@ class ScoredRun:
     score: RunScore
 
 
-def score_runs(
-    study: str | Path, *, raw_truth: bool = False, progress: Callable[[int, int], None] | None = None
-) -> list[ScoredRun]:
+@shows_progress("runs")
+def score_runs(study: str | Path, *, raw_truth: bool = False, progress: Watch = None) -> list[ScoredRun]:
     """Score every run of a study, or the one run that the folder is.
 
     Args:
         study: folder of runs, or of one run.
         raw_truth: True compares with the rotations as published instead of projected onto SO(3).
-        progress: called with (runs scored, runs in all).
+        progress: called with (runs scored, runs in all); None shows a bar when it takes long, False nothing.
 
     Raises:
         InputError: no predictions there, or their ground truth is gone or changed.
@@ -57,13 +56,13 @@ def score_runs(
     folders = find_runs(Path(study))
     runs = []
     for number, folder in enumerate(folders):
-        if progress is not None:
+        if progress:
             progress(number, len(folders))
         info, predictions = read_info(folder), read_predictions(folder)
         pairs = load_run_pairs(info)
         score = summarise(info, pairs, predictions, raw_truth=raw_truth)
         runs.append(ScoredRun(folder, pairs, predictions, score))
-    if progress is not None:
+    if progress:
         progress(len(folders), len(folders))
     return runs
 

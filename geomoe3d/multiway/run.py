@@ -31,6 +31,7 @@ from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
 from geomoe3d.multiway.survey import Survey
 from geomoe3d.pipeline import resolved
+from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.timing import StageClock
 
 _MAP_ROUNDS = 2
@@ -38,6 +39,7 @@ _INITIAL_SHIFT = 2.0  # voxels
 _INITIAL_TURN_DEG = 2.0
 
 
+@shows_progress("pairs")
 def register_scans(
     scans: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     out: str | os.PathLike[str],
@@ -57,7 +59,7 @@ def register_scans(
     initial_error: tuple[float, float] | None = None,
     second_look: bool = False,
     e57: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Watch = None,
     say: Callable[[str], None] | None = None,
 ) -> SceneModel:
     """Place many scans in one model, and say which could not be placed and why.
@@ -86,7 +88,8 @@ def register_scans(
         second_look: look twice at doubtful pairs as `geomoe3d.register` does; three times as slow, and what
             triangles say makes up for it.
         e57: write ``groupN.e57`` too: all points of all scans, each scan with its pose.
-        progress: called with (pairs done, pairs in all so far proposed).
+        progress: called with (pairs done, pairs in all so far proposed); None shows a bar when it takes long, False
+            shows nothing.
         say: called with sentences on what begins.
 
     Raises:
@@ -127,7 +130,7 @@ def register_scans(
     store = BatchStore(folder / "pairs", config, fresh=fresh)
     if store.begins:
         _try_out(labour, found, Settings.of(config, cache) if fresh else None)
-    survey = Survey(found, config, store, labour, progress, say, sequence=sequence, initial=poses)
+    survey = Survey(found, config, store, labour, progress or None, say, sequence=sequence, initial=poses)
     survey.describe(unusable)
     store.begin()
     if fresh:

@@ -14,7 +14,7 @@ from geomoe3d.batch.table import kind_of
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size
 from geomoe3d.config import PreparationConfig
-from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
         elif path.is_file():
             paths.append(path)
         else:
-            raise InputError(f"there is no file or folder '{path}' (folder now: {Path.cwd()})")
+            raise MissingFileError(f"there is no file or folder '{path}' (folder now: {Path.cwd()})")
     resolved = [path.resolve() for path in paths]
     twice = {path for path in resolved if resolved.count(path) > 1}
     if twice:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from geomoe3d.config import build_config
-from geomoe3d.errors import CheckpointError, ConfigError
+from geomoe3d.errors import CheckpointError, ConfigError, MissingWeightsError
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.build import Network, build_network
 from geomoe3d.networks.geomoe import GeoMoE
@@ -150,7 +150,7 @@ def read_card(path: str | Path) -> WeightCard:
     try:
         values = json.loads(place.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise CheckpointError(
+        raise MissingWeightsError(
             f"'{path}' has no card: '{place}' is missing; keep both files together"
         ) from None
     except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -6,7 +6,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from geomoe3d.errors import CheckpointError
+from geomoe3d.errors import CheckpointError, MissingWeightsError
 
 PACKAGED = Path(__file__).parent / "weights"
 DEFAULT_WEIGHTS = "geomoe3d"
@@ -26,7 +26,7 @@ def find_weights(name_or_path: str | Path) -> Path:
     if path.suffix != ".safetensors" and path.name == str(name_or_path) and packaged.is_file():
         return packaged
     names = ", ".join(packaged_names()) or "none in this version"
-    raise CheckpointError(f"no weights '{name_or_path}': no such file, and packaged weights are: {names}")
+    raise MissingWeightsError(f"no weights '{name_or_path}': no such file, and packaged weights are: {names}")
 
 
 def packaged_names() -> list[str]:
@@ -59,7 +59,7 @@ def check_weights(name_or_path: str | Path) -> Path:
     try:
         expected = json.loads(place.read_text(encoding="utf-8"))["sha256"]
     except FileNotFoundError:
-        raise CheckpointError(
+        raise MissingWeightsError(
             f"'{path}' has no card: '{place}' is missing; keep both files together"
         ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:

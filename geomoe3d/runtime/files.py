@@ -12,7 +12,7 @@ import secrets
 from collections.abc import Callable
 from pathlib import Path
 
-from geomoe3d.errors import OutputError
+from geomoe3d.errors import ExistingFileError, OutputError
 
 
 def check_output(path: str | os.PathLike[str], *, force: bool) -> Path:
@@ -43,7 +43,7 @@ def check_output(path: str | os.PathLike[str], *, force: bool) -> Path:
             if not path.is_file():
                 raise OutputError(f"cannot write '{path}': it is not a regular file; give another name")
             if not force:
-                raise OutputError(
+                raise ExistingFileError(
                     f"'{path}' exists; pass --force (force=True) to replace it, or another name"
                 )
     except OutputError:
@@ -104,7 +104,7 @@ def _move(temporary: Path, path: Path, *, force: bool) -> None:
             os.link(temporary, path)  # unlike a rename, a hard link never replaces
             return
         except FileExistsError:
-            raise OutputError(
+            raise ExistingFileError(
                 f"'{path}' exists now, it appeared meanwhile; pass --force (force=True) to replace it, "
                 "or another name"
             ) from None

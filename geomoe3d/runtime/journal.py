@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.errors import FormatError, OutputError, cannot_read
 
 _SYNC_SECONDS = 1.0
 
@@ -35,7 +35,7 @@ def read_journal(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror}") from None
+        raise cannot_read(error, f"cannot read '{path}': {error.strerror}") from None
     with stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):

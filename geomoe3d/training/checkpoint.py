@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from geomoe3d.errors import CheckpointError
+from geomoe3d.errors import CheckpointError, MissingWeightsError
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.config import FREE_KEYS, TrainConfig
@@ -51,7 +51,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise CheckpointError(f"no checkpoint '{path}'") from None
+        raise MissingWeightsError(f"no checkpoint '{path}'") from None
     except Exception as error:  # torch names no common class for what a damaged file raises
         raise CheckpointError(f"checkpoint '{path}' cannot be read: {error}") from None
     if not isinstance(state, dict) or state.get("format") != _FORMAT or state.get("version") != _VERSION:

@@ -53,9 +53,9 @@ def save_page(view: RegistrationView, path: str | os.PathLike[str], *, force: bo
     write_text(path, render_page(view), force=force)
 
 
-def render_page(view: RegistrationView) -> str:
+def render_page(view: RegistrationView, *, max_points: int = MAX_POINTS) -> str:
     """The text of the page that `save_page` writes; the same view gives the same text."""
-    drawing = build_drawing(view, max_points=MAX_POINTS)
+    drawing = build_drawing(view, max_points=max_points)
     result = view.result
     source, target = result.source.name, result.target.name
     made_by = f"geomoe3d {result.versions.get('geomoe3d', '')}".strip()

@@ -8,13 +8,16 @@ Cost: one pass over the correspondences for their residuals.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import residuals
-from geomoe3d.result import RegistrationResult
-from geomoe3d.types import BoolArray, FloatArray, IntArray
+from geomoe3d.types import BoolArray, FloatArray, IntArray, PointCloud
+
+if TYPE_CHECKING:
+    from geomoe3d.result import RegistrationResult
 
 WEIGHT_THRESHOLD = 0.5
 
@@ -50,6 +53,32 @@ class RegistrationView:
     groups: IntArray | None = None
     group_names: tuple[str, ...] = ()
     weight_threshold: float = WEIGHT_THRESHOLD
+
+    @classmethod
+    def of(
+        cls,
+        result: RegistrationResult,
+        clouds: tuple[PointCloud, PointCloud],
+        correspondences: FloatArray,
+        weights: FloatArray | None = None,
+        groups: IntArray | None = None,
+        group_names: tuple[str, ...] = (),
+    ) -> RegistrationView:
+        """From the clouds as loaded, source and target; groups only where more than one of them agrees."""
+        if groups is not None and (weights is None or len(np.unique(groups[weights > WEIGHT_THRESHOLD])) < 2):
+            groups = None  # one colour for all would hide what agrees
+        source, target = clouds
+        return cls(
+            source.file_points,
+            target.file_points,
+            result,
+            correspondences,
+            weights=weights,
+            source_colors=source.colors,
+            target_colors=target.colors,
+            groups=groups,
+            group_names=group_names,
+        )
 
     def __post_init__(self) -> None:
         _check_shape("source_points", self.source_points, (None, 3))

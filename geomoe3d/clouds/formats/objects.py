@@ -51,17 +51,25 @@ def raw_from_object(data: Any) -> RawCloud:
         InputError: nothing that holds points.
         EmptyCloudError: no points.
     """
+    library = library_of(data)
+    if library == "torch":
+        return _array_cloud(_from_torch(data))
+    if library == "open3d":
+        return _from_open3d(data)
+    if library == "trimesh":
+        from geomoe3d.clouds.formats.meshes import flatten
+
+        return flatten(data)
+    return _array_cloud(data)
+
+
+def library_of(data: Any) -> str | None:
+    """Which of torch, open3d and trimesh an object, or a class that it derives from, comes from."""
     for base in type(data).__mro__:
         library = base.__module__.split(".")[0]
-        if library == "torch":
-            return _array_cloud(_from_torch(data))
-        if library == "open3d":
-            return _from_open3d(data)
-        if library == "trimesh":
-            from geomoe3d.clouds.formats.meshes import flatten
-
-            return flatten(data)
-    return _array_cloud(data)
+        if library in ("torch", "open3d", "trimesh"):
+            return library
+    return None
 
 
 def _from_torch(tensor: Any) -> Any:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from geomoe3d.cli.errors import run
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.config import RegistrationConfig
+from geomoe3d.decision.explanation import Explanation
 from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.result import CloudReport, RegistrationResult
@@ -77,7 +78,7 @@ class FakeRegistrar:
         points = np.random.default_rng(0).normal(size=(50, 3))
         moved = transform_points(TRUTH, points)
         origin = np.round(moved.mean(axis=0))
-        return types.SimpleNamespace(
+        return Explanation(
             result=result,
             source=PointCloud(points),
             target=PointCloud(moved - origin, origin=origin),

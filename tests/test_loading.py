@@ -14,7 +14,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from geomoe3d.clouds.io import READABLE_SUFFIXES, WRITABLE_SUFFIXES, check_aligned, load_points, save_points
-from geomoe3d.errors import DependencyError, EmptyCloudError, GeoMoE3DError, InputError, NonFiniteError
+from geomoe3d.errors import (
+    DependencyError,
+    EmptyCloudError,
+    ForbiddenFileError,
+    GeoMoE3DError,
+    InputError,
+    MissingFileError,
+    NonFiniteError,
+)
 from geomoe3d.types import PointCloud
 
 # --- loaded clouds -------------------------------------------------------------------------------------
@@ -81,7 +89,7 @@ def test_one_bad_normal_drops_all_normals(tmp_path: Path, bad: float) -> None:
 
 
 def test_missing_file_and_directory(tmp_path: Path) -> None:
-    fails(tmp_path / "none.ply", "there is no file", "none.ply", error=InputError)
+    fails(tmp_path / "none.ply", "there is no file", "none.ply", error=MissingFileError)
     fails(str(tmp_path), "is a directory", error=InputError)
     (tmp_path / "folder.ply").mkdir()
     fails(tmp_path / "folder.ply", "is a directory", error=InputError)
@@ -134,14 +142,14 @@ def test_unreadable_file(tmp_path: Path, suffix: str, monkeypatch: pytest.Monkey
     monkeypatch.setattr(io, "open", refuse)
     monkeypatch.setattr(builtins, "open", refuse)
     monkeypatch.setattr(Path, "open", refuse)  # Python 3.10 bound io.open when pathlib was imported
-    fails(path, "permission denied", error=InputError)
+    fails(path, "permission denied", error=ForbiddenFileError)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 def test_unreadable_mode(tmp_path: Path) -> None:
     save_points(tmp_path / "a.ply", small_cloud())
     (tmp_path / "a.ply").chmod(0)
-    fails(tmp_path / "a.ply", "permission denied", error=InputError)
+    fails(tmp_path / "a.ply", "permission denied", error=ForbiddenFileError)
 
 
 # --- values --------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from geomoe3d.filters.motion_judge import MotionJudge
 from numpy.typing import NDArray
 
 from geomoe3d.data.threedmatch import BENCHMARKS, iterate_fixed_correspondences
@@ -24,6 +23,7 @@ from geomoe3d.evaluation.calibration import auroc_of
 from geomoe3d.evaluation.metrics import is_right, motion_errors, precision_recall_f1
 from geomoe3d.evaluation.records import INLIER_THRESHOLD, VOXEL_SIZE
 from geomoe3d.geometry.se3 import residuals
+from geomoe3d.networks.motion_judge import MotionJudge
 from geomoe3d.types import BoolArray, Correspondences, FloatArray
 
 FIRST, MOST = 8, 20

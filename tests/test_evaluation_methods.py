@@ -253,9 +253,28 @@ def test_identities_differ_where_answers_may():
     assert make_method("geomoe3d").identity() == plain
 
 
-def test_assignments_are_for_geomoe3d_alone():
+@pytest.mark.parametrize("name", ["pointcn", "geomoe-plain"])
+def test_networks_with_weights_of_the_user_are_methods(name, tmp_path):
+    from tiny_networks import settle, small, tiny
+
+    from geomoe3d.networks.pretrained import WeightCard, save_pretrained
+
+    path = tmp_path / "w.safetensors"
+    network = settle(tiny() if name == "geomoe-plain" else small(name))
+    save_pretrained(path, network, WeightCard(architecture={}))
+    method = make_method(name, [f"filter.weights={path}"])
+    assert method.inputs == {"correspondences"}
+    rows = correspondences(0.6)
+    answer = method(pair_of(rows))
+    assert answer.weights.shape == answer.inliers.shape == (len(rows),)
+    assert str(path) in json.dumps(method.identity())
+    with pytest.raises(InputError, match=f"'{name}' needs trained weights"):
+        make_method(name)
+
+
+def test_assignments_are_for_those_that_take_any():
     for name in ("consensus", "open3d-fgr", "mine.py:register"):
-        with pytest.raises(InputError, match="only 'geomoe3d'"):
+        with pytest.raises(InputError, match="takes none; 'geomoe3d' and networks"):
             make_method(name, ["voxel_size=0.1"])
     with pytest.raises(ConfigError, match=r"matching\.neighbors"):
         make_method("geomoe3d", ["matching.neighbours=2"])

@@ -62,7 +62,7 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 "assignments",
                 metavar="KEY=VALUE",
                 multiple=True,
-                help="Configuration of the method geomoe3d; repeatable.",
+                help="Configuration of geomoe3d and of networks with weights of yours; repeatable.",
             ),
             click.option("--label", help="Name of the run, if there is one method. [the method's]"),
             click.option(
@@ -162,7 +162,7 @@ def compare(first: str, second: str) -> None:
 @traceback_option
 def methods() -> None:
     """List the methods, the inputs each accepts, and what is not installed."""
-    from geomoe3d.evaluation.methods import make_method, method_names
+    from geomoe3d.evaluation.methods import TRAINED, make_method, method_names
 
     for name in method_names():
         method = make_method(name)
@@ -170,6 +170,8 @@ def methods() -> None:
         click.echo(
             f"{name:24} {', '.join(sorted(method.inputs)):26} {'' if reason is None else reason}".rstrip()
         )
+    for name in TRAINED:
+        click.echo(f"{name:24} {'correspondences':26} with weights of yours: --set filter.weights=FILE")
 
 
 def _predict(
@@ -189,13 +191,15 @@ def _predict(
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
     from geomoe3d.errors import InputError
     from geomoe3d.evaluation.evaluation_set import EvaluationSet
+    from geomoe3d.evaluation.methods import CONFIGURABLE
     from geomoe3d.evaluation.predict import MethodSpec, predict
 
     if label is not None and len(methods) != 1:
         raise InputError(f"--label names one run, but {len(methods)} methods are given; give one method")
-    if assignments and "geomoe3d" not in methods:
-        raise InputError("--set is for the method geomoe3d, which is not among those given")
-    specs = [MethodSpec(name, assignments if name == "geomoe3d" else (), label) for name in methods]
+    if assignments and not CONFIGURABLE & set(methods):
+        takers = ", ".join(sorted(CONFIGURABLE))
+        raise InputError(f"--set is for {takers}, which are not among those given")
+    specs = [MethodSpec(name, assignments if name in CONFIGURABLE else (), label) for name in methods]
     sets = [EvaluationSet(benchmark, track, root, every, num_unrelated, seed) for benchmark in benchmarks]
     for one in sets[1:]:
         one.pairs()  # a wrong name is told at once, not when the first benchmark is done

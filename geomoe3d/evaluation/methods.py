@@ -37,9 +37,21 @@ OURS: dict[str, tuple[str, ...]] = {
 }
 """Our methods and what each sets; all but ``geomoe3d`` take correspondences alone and are fixed."""
 
+TRAINED: dict[str, tuple[str, ...]] = {
+    name: ("scoring.scorers=[surfaces]", f"filter.name={kind}", "estimator.name=svd")
+    for name, kind in {
+        "geomoe-plain": "geomoe",
+        **{kind: kind for kind in ("pointcn", "oanet", "umatch", "dematch", "demo", "pointdsc")},
+    }.items()
+}
+"""Networks that weigh correspondences, weighted least squares on their weights: ``filter.weights`` is needed."""
+
+CONFIGURABLE = frozenset({"geomoe3d", *TRAINED})
+"""Methods that take values of the configuration."""
+
 
 def method_names() -> list[str]:
-    """Every name that `make_method` knows, ours first; a user's function has no name here."""
+    """Every name that needs no weights, ours first; a user's function has no name here."""
     return [*OURS, *PEERS]
 
 
@@ -47,8 +59,8 @@ def make_method(spec: str, assignments: Sequence[str] = ()) -> Method:
     """The method of a name, or a user's function.
 
     Args:
-        spec: one of `method_names`, ``path/to/file.py:function`` or ``package.module:function``.
-        assignments: ``key=value`` of the configuration; only ``geomoe3d`` takes any.
+        spec: one of `method_names` or `TRAINED`, ``path/to/file.py:function`` or ``package.module:function``.
+        assignments: ``key=value`` of the configuration; those of `CONFIGURABLE` take any.
 
     Raises:
         InputError: an unknown name (the message gives the nearest one), a function that cannot be loaded, or
@@ -56,18 +68,20 @@ def make_method(spec: str, assignments: Sequence[str] = ()) -> Method:
         ConfigError: an unknown key or an invalid value.
         CheckpointError: trained weights are missing, broken or do not fit.
     """
-    if assignments and spec != "geomoe3d":
+    if assignments and spec not in CONFIGURABLE:
         raise InputError(
-            f"'{assignments[0]}' sets a configuration value, but '{spec}' takes none; only 'geomoe3d' does"
+            f"'{assignments[0]}' sets a configuration value, but '{spec}' takes none; 'geomoe3d' and networks "
+            f"with weights of yours ({', '.join(TRAINED)}) do"
         )
-    if spec in OURS:
+    if spec in OURS or spec in TRAINED:
         return OurMethod(spec, assignments)
     if spec in PEERS:
         return PEERS[spec]
     if ":" in spec:
         return AdaptedFunction(spec)
-    close = difflib.get_close_matches(spec.lower(), method_names(), n=1, cutoff=0.4)
-    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(method_names())}."
+    known = [*method_names(), *TRAINED]
+    close = difflib.get_close_matches(spec.lower(), known, n=1, cutoff=0.4)
+    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}."
     raise InputError(f"unknown method '{spec}'; {hint} A function of your own is written file.py:function")
 
 
@@ -80,7 +94,7 @@ class OurMethod:
     assigned. The seed is always that of the input.
 
     Args:
-        name: one of `OURS`.
+        name: one of `OURS` or `TRAINED`.
         assignments: ``key=value`` beside what the name sets.
 
     Raises:
@@ -91,10 +105,13 @@ class OurMethod:
     def __init__(self, name: str, assignments: Sequence[str] = ()) -> None:
         self.name = name
         self.inputs = frozenset({"correspondences", "clouds"} if name == "geomoe3d" else {"correspondences"})
+        settings = OURS[name] if name in OURS else TRAINED[name]
         keys = {assignment.partition("=")[0].strip() for assignment in assignments}
+        if name in TRAINED and "filter.weights" not in keys:
+            raise InputError(f"'{name}' needs trained weights; give --set filter.weights=FILE")
         if "seed" in keys:
             raise ConfigError("'seed' is that of the evaluation for all methods; leave it out of the values")
-        self.config: RegistrationConfig = resolved(load_config(None, [*OURS[name], *assignments]))
+        self.config: RegistrationConfig = resolved(load_config(None, [*settings, *assignments]))
         self._own_threshold = "estimator.inlier_threshold" in keys
         self._registrar: Registrar | None = None
         self._solver: CorrespondenceRegistrar | None = None

@@ -1,0 +1,116 @@
+"""A cloud on three grids, each with FPFH of its own reach, and how points of one lie to those of another.
+
+The fine grid is the cloud's; of the coarser ones, twice and four times as wide, each holds one point of the
+cloud per voxel. FPFH with radius 5 of each grid's voxels so sees 5, 10 and 20 voxels far at the price of
+little more than the first. `multiscale` joins the three; `learned` makes more of them. All of it turns with
+the cloud.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geomoe3d.clouds.prepare import voxel_keys
+from geomoe3d.features.fpfh import FpfhDescriptor
+from geomoe3d.runtime.threads import usable_threads
+from geomoe3d.types import Float32Array, IntArray, PreparedCloud
+
+FACTORS = (1, 2, 4)
+"""Edges of the grids, in voxels of the cloud."""
+NUM_RELATIONS = 8
+"""Numbers by which `relations` says how one point lies to another."""
+_TINY = np.float32(1e-6)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Some of a cloud's points, lengths in voxels of the cloud.
+
+    Attributes:
+        rows: (m,) which of the cloud's points.
+        points: (m, 3) float32, relative to the cloud's centroid.
+        normals: (m, 3) float32 unit normals.
+        features: (m, 33) float32 FPFH of length 1, of the points of this level alone.
+        edge: of its grid.
+    """
+
+    rows: IntArray
+    points: Float32Array
+    normals: Float32Array
+    features: Float32Array
+    edge: int
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def take(self, rows: IntArray | slice) -> Level:
+        """Only these points of it."""
+        kept = self.rows[rows], self.points[rows], self.normals[rows], self.features[rows]
+        return Level(*kept, self.edge)
+
+
+def pyramid(cloud: PreparedCloud) -> tuple[Level, ...]:
+    """The levels of a cloud of at least one point, finest first; see `FACTORS`."""
+    places = ((cloud.points - cloud.points.mean(0)) / cloud.voxel_size).astype(np.float32)
+    normals = cloud.normals.astype(np.float32)
+    levels = []
+    for edge in FACTORS:
+        rows = one_per_voxel(cloud, edge)
+        some = replace(cloud, points=cloud.points[rows], normals=cloud.normals[rows], features=None)
+        features = FpfhDescriptor(radius=5.0 * edge)(some)
+        levels.append(Level(rows, places[rows], normals[rows], features, edge))
+    return tuple(levels)
+
+
+def one_per_voxel(cloud: PreparedCloud, edge: int) -> IntArray:
+    """The cloud's first point in every voxel of a grid so many times as wide; all points at 1."""
+    if edge == 1:
+        return np.arange(len(cloud))
+    _, first = np.unique(voxel_keys(cloud.points, edge * cloud.voxel_size), return_index=True)
+    return np.sort(first)
+
+
+def nearest(at: Level, of: Level, count: int) -> tuple[Float32Array, IntArray]:
+    """Distances and rows (m, k) of the nearest points of a level, nearest first; k: ``count`` or all."""
+    from scipy.spatial import cKDTree
+
+    k = min(count, len(of))
+    tree = cKDTree(of.points, balanced_tree=False, compact_nodes=False)
+    distance, row = tree.query(at.points, k=k, workers=usable_threads())
+    return np.asarray(distance, dtype=np.float32).reshape(-1, k), np.asarray(row).reshape(-1, k)
+
+
+def relations(at: Level, of: Level, rows: IntArray) -> Float32Array:
+    """How points of ``of`` lie to points of ``at``, (m, k, 8), the same however the cloud is turned.
+
+    Distance, height of either point over the other's plane, cosine between the normals, their triple product
+    with the connection, the sines of both heights, and the distance squared; lengths in 4 edges of ``of``'s
+    grid.
+
+    Args:
+        at: m points.
+        of: level of the others.
+        rows: (m, k) of ``of``.
+    """
+    # One coordinate at a time: numpy is then ten times as quick as along a last axis of three.
+    way = [of.points[rows, axis] - at.points[:, axis, None] for axis in range(3)]
+    for coordinate in way:
+        coordinate /= np.float32(4 * of.edge)
+    there = [of.normals[rows, axis] for axis in range(3)]
+    here = [at.normals[:, axis, None] for axis in range(3)]
+    squared, over_here, over_there = _dot(way, way), _dot(way, here), _dot(way, there)
+    distance = np.sqrt(squared) + _TINY
+    (x, y, z), (a, b, c) = way, there
+    triple = _dot(here, [y * c - z * b, z * a - x * c, x * b - y * a])
+    slopes = over_here / distance, over_there / distance
+    found: Float32Array = np.stack(
+        [distance, over_here, over_there, _dot(there, here), triple, *slopes, squared], axis=-1
+    )
+    return found
+
+
+def _dot(a: list[Float32Array], b: list[Float32Array]) -> Float32Array:
+    product: Float32Array = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product

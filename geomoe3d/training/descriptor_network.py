@@ -1,0 +1,109 @@
+"""The network of the learned descriptor in torch, to be trained; `geomoe3d.features.learned` evaluates it in
+numpy.
+
+Both take the same levels, neighbours and relations from `geomoe3d.features.pyramid`, and the tensors have the
+same names. Training needs features at a few hundred points of a cloud only, hence ``queries``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from geomoe3d.features.learned import DIMENSION, NUM_NEIGHBORS
+from geomoe3d.features.pyramid import NUM_RELATIONS, Level, nearest, relations
+from geomoe3d.types import IntArray
+
+WIDTH = 64
+_FPFH = 33
+_INPUT_SCALE = 4.0  # FPFH of length 1 is small beside the biases a layer starts with
+LOOKS = {
+    "middle_middle": (1, 1),
+    "coarse_middle": (2, 1),
+    "coarse_coarse": (2, 2),
+    "fine_middle": (0, 1),
+    "fine_coarse": (0, 2),
+}
+"""Which level looks at which, in the order of evaluation."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the network is shown of one cloud.
+
+    Attributes:
+        given: of the queries, the middle and the coarse level, what each point begins with.
+        rows: by look, (m, k) neighbours.
+        lie: by look, (m, k, 8) how they lie.
+    """
+
+    given: tuple[Tensor, ...]
+    rows: dict[str, Tensor]
+    lie: dict[str, Tensor]
+
+    @classmethod
+    def of(cls, levels: tuple[Level, ...], queries: IntArray) -> View:
+        """Of a pyramid, with features wanted at these rows of its finest level."""
+        fine, middle, coarse = levels
+        asked = (fine.take(queries), middle, coarse)
+        given = [torch.from_numpy(asked[0].features)]
+        for level in (middle, coarse):
+            both = torch.from_numpy(fine.features[level.rows]), torch.from_numpy(level.features)
+            given.append(torch.cat(both, 1))
+        rows, lie = {}, {}
+        for name, (at, of) in LOOKS.items():
+            _, near = nearest(asked[at], levels[of], NUM_NEIGHBORS)
+            rows[name] = torch.from_numpy(near)
+            lie[name] = torch.from_numpy(relations(asked[at], levels[of], near))
+        return cls(tuple(given), rows, lie)
+
+
+class Look(nn.Module):
+    """A point looks at its neighbours: largest and mean of what each shows it join what it holds."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.lie = nn.Linear(NUM_RELATIONS, width)
+        self.there = nn.Linear(width, width, bias=False)
+        self.here = nn.Linear(width, width, bias=False)
+        self.out = nn.Sequential(
+            nn.Linear(3 * width, width), nn.LayerNorm(width), nn.ReLU(), nn.Linear(width, width)
+        )
+
+    def forward(self, held: Tensor, of_held: Tensor, rows: Tensor, lie: Tensor) -> Tensor:
+        """(m, width) of ``held`` (m, width), what the other level holds, and the neighbours."""
+        seen = torch.relu(self.lie(lie) + self.there(of_held)[rows] + self.here(held)[:, None])
+        joined = torch.cat([seen.max(1).values, seen.mean(1), held], 1)
+        found: Tensor = held + self.out(joined)
+        return found
+
+
+class DescriptorNetwork(nn.Module):
+    """FPFH on three grids to features of 32 numbers and length 1."""
+
+    def __init__(self, width: int = WIDTH) -> None:
+        super().__init__()
+        embed = [_mlp(inputs, width, width) for inputs in (_FPFH, 2 * _FPFH, 2 * _FPFH)]
+        self.embed = nn.ModuleList(embed)
+        for name in LOOKS:
+            self.add_module(name, Look(width))
+        self.head = _mlp(3 * width, 2 * width, DIMENSION)
+        with torch.no_grad():
+            for layers in embed:
+                next(layers.parameters()).mul_(_INPUT_SCALE)
+
+    def forward(self, view: View) -> Tensor:
+        """(q, 32) features of the queries."""
+        held = [embed(given) for embed, given in zip(self.embed, view.given, strict=True)]
+        own = held[0]
+        seen = []
+        for name, (at, of) in LOOKS.items():
+            held[at] = self.get_submodule(name)(held[at], held[of], view.rows[name], view.lie[name])
+            seen.append(held[at])
+        return nn.functional.normalize(self.head(torch.cat([own, seen[-2], seen[-1]], 1)), dim=1)
+
+
+def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))

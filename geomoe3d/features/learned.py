@@ -27,7 +27,9 @@ from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, PreparedCloud
 
 NUM_NEIGHBORS = 16
-DIMENSION = 32
+LEARNED = 32
+DIMENSION = LEARNED + 33
+_FPFH_SHARE = 0.3  # of the similarity of two features; more hardly changes what is found
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
 _CHUNK = 256  # points at a time: what they and their neighbours hold stays near a core
 _EPSILON = np.float32(1e-5)  # of torch's layer norm
@@ -35,8 +37,8 @@ _EPSILON = np.float32(1e-5)  # of torch's layer norm
 
 @descriptor("learned")
 class LearnedDescriptor(Descriptor):
-    """Features of 32 numbers, learnt by contrast on generated rooms, scans and bodies, and one recorded
-    lounge.
+    """32 numbers learnt by contrast on generated rooms, scans and bodies and one recorded lounge, joined with
+    the FPFH that they begin with, which by itself still finds what they do not.
 
     Args:
         weights: a .safetensors file that `geomoe3d.training.descriptor` wrote; None takes what ships.
@@ -59,7 +61,9 @@ class LearnedDescriptor(Descriptor):
         if not levels[0].features.any():  # isolated points have nothing to go by
             return np.zeros((len(cloud), DIMENSION), dtype=np.float32)
         with single_blas_thread():
-            return _Network(self._tensors, levels).features()
+            learned = _Network(self._tensors, levels).features()
+        shares = np.sqrt(np.float32([1 - _FPFH_SHARE, _FPFH_SHARE]))
+        return np.hstack([shares[0] * learned, shares[1] * levels[0].features])
 
 
 class _Network:
@@ -141,6 +145,6 @@ def load_tensors(path: Path) -> dict[str, Float32Array]:
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"weights of a descriptor '{path}' cannot be read: {error}") from None
     shape = found["head.2.weight"].shape if "head.2.weight" in found else None
-    if shape is None or shape[0] != DIMENSION:
+    if shape is None or shape[0] != LEARNED:
         raise CheckpointError(f"'{path}' holds no weights of the learned descriptor")
     return {name: tensor.astype(np.float32) for name, tensor in found.items()}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from geomoe3d.features.learned import DIMENSION, NUM_NEIGHBORS
+from geomoe3d.features.learned import LEARNED, NUM_NEIGHBORS
 from geomoe3d.features.pyramid import NUM_RELATIONS, Level, nearest, relations
 from geomoe3d.types import IntArray
 
@@ -89,7 +89,7 @@ class DescriptorNetwork(nn.Module):
         self.embed = nn.ModuleList(embed)
         for name in LOOKS:
             self.add_module(name, Look(width))
-        self.head = _mlp(3 * width, 2 * width, DIMENSION)
+        self.head = _mlp(3 * width, 2 * width, LEARNED)
         with torch.no_grad():
             for layers in embed:
                 next(layers.parameters()).mul_(_INPUT_SCALE)

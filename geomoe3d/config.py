@@ -56,7 +56,11 @@ class PreparationConfig(Section):
 class DescriptorConfig(PartConfig):
     """What describes the surface around each point in numbers that can be compared."""
 
-    name: str = Field("fpfh", description="fpfh, or a class of your own: file.py:Class or module:Class")
+    name: str = Field(
+        "fpfh",
+        description="fpfh; multiscale (fpfh of three reaches); learned (a small network on these; more true matches, "
+        "but confidence was fitted with fpfh); or a class of your own: file.py:Class or module:Class",
+    )
     radius: float = Field(5.0, gt=0, description="neighbourhood of a feature, in voxels")
     neighbors: int = Field(100, ge=3, description="at most so many points make a feature")
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geomoe3d.features.base import Descriptor, with_features, with_normals_flipped
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +15,7 @@ from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import CheckpointError
+from geomoe3d.features.base import Descriptor, with_features, with_normals_flipped
 from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.features.learned import LEARNED, WEIGHTS, LearnedDescriptor, load_tensors
 from geomoe3d.features.multiscale import MultiscaleDescriptor

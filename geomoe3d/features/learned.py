@@ -62,7 +62,7 @@ class LearnedDescriptor(Descriptor):
             return np.zeros((len(cloud), DIMENSION), dtype=np.float32)
         with single_blas_thread():
             learned = _Network(self._tensors, levels).features()
-        shares = np.sqrt(np.float32([1 - _FPFH_SHARE, _FPFH_SHARE]))
+        shares = np.sqrt(np.array([1 - _FPFH_SHARE, _FPFH_SHARE], dtype=np.float32))
         return np.hstack([shares[0] * learned, shares[1] * levels[0].features])
 
 

@@ -223,6 +223,10 @@ _MOVED = {
 """Keys of version 0.1.0 and where they stand now."""
 
 
+_INSTALLED = Path(__file__).with_name("configs")  # in a checkout they stand beside the package
+_CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "configs"
+
+
 def known_keys(section: type[Section], prefix: str = "") -> list[str]:
     """Dotted names of every leaf of a configuration tree, in declaration order."""
     keys: list[str] = []
@@ -284,7 +288,7 @@ def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read one YAML mapping.
+    """Read one YAML mapping; ``configs/...`` are those that come with the package, wherever it is called.
 
     Raises:
         ConfigError: the file is missing, unreadable, no YAML, or holds no mapping.
@@ -292,10 +296,14 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     import yaml
 
     try:
-        tree = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        tree = yaml.safe_load(_shipped(Path(path)).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        names = ", ".join(str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml")))
+        raise MissingConfigError(
+            f"cannot read configuration '{path}': {error.strerror}; those that come with geomoe3d: {names}"
+        ) from None
     except OSError as error:
-        kind = MissingConfigError if isinstance(error, FileNotFoundError) else ConfigError
-        raise kind(f"cannot read configuration '{path}': {error.strerror}") from None
+        raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"'{path}' is not valid YAML: {error}") from None
     if tree is None:
@@ -303,6 +311,11 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise ConfigError(f"'{path}' holds a {type(tree).__name__}, expected a mapping of keys to values")
     return tree
+
+
+def _shipped(path: Path) -> Path:
+    """The file itself; where there is none, the one of that name among those that come with the package."""
+    return path if path.exists() or path.is_absolute() else _CONFIGS.parent / path
 
 
 def load_config(path: str | Path | None = None, assignments: list[str] | None = None) -> RegistrationConfig:

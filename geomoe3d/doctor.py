@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from geomoe3d.runtime.machine import Machine
@@ -110,6 +111,7 @@ def examine(machine: Machine | None = None) -> list[Finding]:
             open3d.result(),
             torch.result(),
             *(future.result() for future in modules[len(libraries) :]),
+            _check_register(machine),
             _check_memory(machine),
             _check_display(machine),
         ]
@@ -279,6 +281,15 @@ def _check_module(machine: Machine, module: str, requirement: str, purpose: str 
         return Finding(name, "missing", "not installed" + note, mend, required)
     mend = _pip(machine, f"install --force-reinstall '{requirement}'")
     return Finding(name, "broken", outcome.text, mend, required)
+
+
+def _check_register(machine: Machine) -> Finding:
+    """Whether the short name means ours; another `register` is easily installed, by Tcl or an old package."""
+    found, ours = machine.register_on_path(), Path(machine.executable()).parent
+    if found is None or Path(found).parent == ours:
+        return Finding("register", "ok", found or "not on the PATH", required=False)
+    mend = f'call `geomoe3d register` instead, or put ours first: export PATH="{ours}:$PATH"'
+    return Finding("register", "broken", f"{found} comes first on the PATH", mend, required=False)
 
 
 def _check_memory(machine: Machine) -> Finding:

@@ -226,3 +226,23 @@ def test_a_dumped_configuration_builds_the_same() -> None:
     config = load_config(None, ["voxel_size=0.3", "filter.name=spectral", "scoring.scorers=[]"])
     assert build_config(RegistrationConfig, config.model_dump(mode="json")) == config
     assert build_config(RegistrationConfig, yaml.safe_load(yaml.safe_dump(config.model_dump()))) == config
+
+
+# ---- configurations that come with the package -------------------------------------------------------
+
+
+def test_shipped_configurations_are_found_by_name_from_anywhere(tmp_path, monkeypatch):
+    from geomoe3d.training.config import load_train_config
+
+    monkeypatch.chdir(tmp_path)
+    assert load_config("configs/default.yaml") == RegistrationConfig()
+    assert load_train_config("configs/train/motions.yaml").data.train
+    assert load_train_config("configs/train/paper/oanet.yaml")  # has a base beside it
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "default.yaml").write_text("seed: 5")
+    assert load_config("configs/default.yaml").seed == 5  # a file of the user's own comes first
+
+
+def test_a_missing_configuration_names_those_that_come_with_the_package(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"configs/default\.yaml.*configs/train/motions\.yaml"):
+        load_config(tmp_path / "none.yaml")

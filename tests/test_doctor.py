@@ -32,6 +32,7 @@ class Patient(Machine):
             "executable": "/venv/bin/python",
             "glibc": (2, 36),
             "is_root": False,
+            "register_on_path": "/venv/bin/register",
             "memory": (8 * 2**30, 16 * 2**30),
             "display": ":0",
         }
@@ -85,6 +86,14 @@ def test_missing_libraries_are_mended_by_one_command_that_names_them_all():
     command = "sudo apt-get update && sudo apt-get install -y --no-install-recommends libegl1 libusb-1.0-0"
     assert doctor.mending_commands(list(findings.values())) == [command]
     assert f"  {command}" in doctor.report(list(findings.values())).splitlines()
+
+
+def test_another_program_called_register_is_named():
+    finding = findings_of(register_on_path="/usr/bin/register")["register"]
+    assert finding.state == "broken" and not finding.required
+    assert "/usr/bin/register comes first" in finding.detail
+    assert "geomoe3d register" in finding.mend and 'export PATH="/venv/bin:$PATH"' in finding.mend
+    assert findings_of(register_on_path=None)["register"].state == "ok"
 
 
 def test_root_needs_no_sudo_and_fedora_no_apt():

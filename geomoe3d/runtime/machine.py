@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -95,6 +96,10 @@ class Machine:
             return ImportOutcome(False, f"the process died of signal {-done.returncode} during import")
         lines = done.stderr.strip().splitlines()
         return ImportOutcome(False, lines[-1] if lines else f"exit code {done.returncode}")
+
+    def register_on_path(self) -> str | None:
+        """Where the shell finds `register`, or None."""
+        return shutil.which("register")
 
     def memory(self) -> tuple[int, int] | None:
         """Available and total memory in bytes, None where the system does not say."""

@@ -171,7 +171,8 @@ class Registrar:
             if other[2].judgement.confidence > decision.judgement.confidence:
                 pair, weighed, decision = other
         read = (source, target), pair.clouds, wanted, places is not None
-        for remark in remarks(*read, config.preparation, decision.judgement):
+        told_of = remarks(*read, config.preparation, decision.judgement)
+        for remark in (*clouds[0].notes, *clouds[1].notes, *told_of):
             decision = decision.with_note(remark)
         if NETWORK in self.pipeline.scorers:
             opinion = opinion_of(decision.answer)

@@ -30,6 +30,7 @@ class PointCloud:
         colors: (N, 3) in [0, 1] or None.
         name: what to call the cloud in messages.
         num_non_finite: rows dropped because a coordinate was NaN or infinite.
+        notes: sentences on what of the file was not taken as it stands.
     """
 
     points: FloatArray
@@ -38,6 +39,7 @@ class PointCloud:
     colors: FloatArray | None = None
     name: str = "cloud"
     num_non_finite: int = 0
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)

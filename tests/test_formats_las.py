@@ -54,7 +54,10 @@ def test_truncated_and_lying_las(tmp_path: Path, suffix: str) -> None:
     path.write_bytes(whole[:107] + struct.pack("<I", 150_000) + whole[111:])
     fails(path, "says 150000 points", "holds 100;" if suffix == ".las" else "holds 1 chunks")
     path.write_bytes(whole[:107] + struct.pack("<I", 60) + whole[111:])  # PDAL reads so many too
-    np.testing.assert_allclose(load_points(path).file_points, small_cloud()[:60], atol=1e-6)
+    cloud = load_points(path)
+    np.testing.assert_allclose(cloud.file_points, small_cloud()[:60], atol=1e-6)
+    held = "the header says 60 points, the file holds 100; the rest is left out"
+    assert [held in note for note in cloud.notes] == ([True] if suffix == ".las" else [])
     path.write_bytes(b"hello world" * 100)
     fails(path, "no LAS file")
 
@@ -98,3 +101,13 @@ def test_copc_is_the_laz_that_it_is(tmp_path: Path) -> None:
     cloud = read_raw(tmp_path / "a.copc.laz")
     np.testing.assert_array_equal(cloud.points, read_raw(tmp_path / "plain.las").points)
     np.testing.assert_array_equal(cloud.fields["intensity"], np.arange(1, 301))
+
+
+def test_a_damaged_size_of_chunks_takes_no_memory(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    save_points(tmp_path / "a.laz", small_cloud())
+    whole = (tmp_path / "a.laz").read_bytes()
+    place = whole.index(b"laszip encoded") - 2 + 54 + 12
+    assert whole[place : place + 4] == struct.pack("<I", 50_000)
+    (tmp_path / "a.laz").write_bytes(whole[:place] + struct.pack("<I", 9_421_648) + whole[place + 4 :])
+    fails(tmp_path / "a.laz", "9421648 points per chunk and 100 in all")

@@ -127,6 +127,8 @@ def test_all_modes_give_the_same_cloud(tmp_path: Path, rows: int) -> None:
         assert set(cloud.fields) == {"ring", "time"} and cloud.fields["ring"].dtype == np.uint16
         np.testing.assert_allclose(cloud.colors, np.tile([1, 128 / 255, 64 / 255], (rows, 1)))
         pose = "sensor pose (VIEWPOINT 1 0 0 1 0 0 0)"
+        (note,) = load_points(tmp_path / f"{name}.pcd").notes
+        assert note.startswith(f"'{name}.pcd': {pose} is not applied")
         assert cloud.unread == ("fpfh", pose, f"grid of {rows // 10} x 10")
 
 

@@ -154,6 +154,7 @@ def load_points(
         colors=cloud.colors,
         name=label,
         num_non_finite=num_non_finite,
+        notes=tuple(f"'{label}': {note}" for note in raw.notes),
     )
 
 

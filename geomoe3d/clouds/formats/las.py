@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -56,7 +57,10 @@ def read_las(path: Path) -> RawCloud:
             las = reader.read()
             if len(las.points) != reader.header.point_count:
                 raise wrong_count(path, reader.header.point_count, len(las.points))
-            return _cloud(las)
+            rest = _held(path, reader.header) - len(las.points)
+            note = f"the header says {len(las.points)} points, the file holds {len(las.points) + rest}; "
+            notes = (f"{note}the rest is left out, as PDAL does",) if rest > 0 else ()
+            return replace(_cloud(las), notes=notes)
     except (FormatError, PermissionError):
         raise
     except BaseException as error:  # lazrs may panic on damaged data, which is no Exception
@@ -115,6 +119,16 @@ def _check_records(path: Path) -> None:
         )
 
 
+def _held(path: Path, header: Any) -> int:
+    """Points that a LAS has room for up to its end or what follows them; those of a LAZ are as many as it says."""
+    if header.are_points_compressed:
+        return int(header.point_count)
+    end = path.stat().st_size
+    for key in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
+        end = min(end, getattr(header, key, 0) or end)
+    return int((end - header.offset_to_point_data) // header.point_format.size)
+
+
 def _check_size(path: Path, header: Any) -> None:
     """Hold the header against the file's size, which laspy does not."""
     size = path.stat().st_size
@@ -126,7 +140,7 @@ def _check_size(path: Path, header: Any) -> None:
             )
         _check_chunk_table(path, header, size)
         return
-    held = (size - header.offset_to_point_data) // header.point_format.size
+    held = _held(path, header)
     if held < header.point_count:
         raise wrong_count(path, header.point_count, max(held, 0))
 
@@ -153,6 +167,10 @@ def _check_chunk_table(path: Path, header: Any, size: int) -> None:
         )
     records = header.vlrs.get("LasZipVlr")
     chunk_points = int.from_bytes(records[0].record_data[12:16], "little") if records else 0
+    if max(1_000_000, header.point_count) < chunk_points < 0xFFFFFFFF:  # lazrs makes room for all of them
+        raise FormatError(
+            f"'{path}' is damaged: it says {chunk_points} points per chunk and {header.point_count} in all"
+        )
     if 0 < chunk_points < 0xFFFFFFFF and -(-header.point_count // chunk_points) != num_chunks:
         raise FormatError(
             f"'{path}': the header says {header.point_count} points, the file holds {num_chunks} chunks of "

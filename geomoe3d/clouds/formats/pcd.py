@@ -7,7 +7,7 @@ A sensor's pose in VIEWPOINT is not applied, as in the Point Cloud Library itsel
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -43,6 +43,7 @@ class _Header:
     data: str
     num_lines: int
     unread: tuple[str, ...]
+    notes: tuple[str, ...]
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -82,7 +83,7 @@ def read_pcd(path: Path) -> RawCloud:
             chosen.append(columns[k])
     wide = [name for name, count in zip(header.names, header.counts, strict=True) if count != 1]
     unread = (*(name for name in wide if name != "_"), *header.unread)
-    return cloud_of(names, chosen, unread=unread)
+    return replace(cloud_of(names, chosen, unread=unread), notes=header.notes)
 
 
 def _read_header(handle: BinaryIO, path: Path) -> _Header:
@@ -133,13 +134,14 @@ def _read_header(handle: BinaryIO, path: Path) -> _Header:
     if not 0 < sum(repeats) < 1 << 20:
         raise FormatError(f"'{path}': COUNT names {sum(repeats)} values per point")
     unread: list[str] = []
+    notes: tuple[str, ...] = ()
     if entries.get("VIEWPOINT") and not _is_identity(entries["VIEWPOINT"]):
         unread.append(f"sensor pose (VIEWPOINT {' '.join(entries['VIEWPOINT'])})")
+        notes = (f"{unread[0]} is not applied to its points, as in the Point Cloud Library",)
     if len(grid) == 2 and grid[1] > 1:
         unread.append(f"grid of {grid[0]} x {grid[1]}")
-    return _Header(
-        names, [_KINDS[kind] for kind in kinds], repeats, num_points, data, num_lines, tuple(unread)
-    )
+    stored = [_KINDS[kind] for kind in kinds]
+    return _Header(names, stored, repeats, num_points, data, num_lines, tuple(unread), notes)
 
 
 def _is_identity(viewpoint: list[str]) -> bool:

@@ -46,6 +46,7 @@ class RawCloud:
         fields: whatever other numbers (N,) the file holds for each point, such as intensity, by name and in
             the type of the file.
         unread: names of what else the file says and nothing here holds.
+        notes: sentences on what was not taken as it stands, which its user should know.
     """
 
     points: FloatArray
@@ -54,6 +55,7 @@ class RawCloud:
     faces: IntArray | None = None
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def take(self, rows: NDArray[np.bool_]) -> RawCloud:
         """The points of a mask with all that belongs to them; faces are given up."""
@@ -63,6 +65,7 @@ class RawCloud:
             None if self.colors is None else self.colors[rows],
             fields={name: values[rows] for name, values in self.fields.items()},
             unread=self.unread,
+            notes=self.notes,
         )
 
 

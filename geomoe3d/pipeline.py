@@ -20,15 +20,25 @@ from geomoe3d.features.cache import FeatureCache, feature_identity
 from geomoe3d.filters.base import OutlierFilter, outlier_filter
 from geomoe3d.matching.base import Matcher, matcher
 from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, judges_transforms, packaged_names
-from geomoe3d.parts import Part
+from geomoe3d.parts import Part, Registry
 from geomoe3d.refinement.base import Refiner, refiner
 from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.scoring.base import Scorer, make_scorers
+from geomoe3d.scoring.base import Scorer, make_scorers, scorer
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 _LINE = ("geomoe3d.registration", "geomoe3d.correspondence_registration")
 
+
+REGISTRIES: dict[str, Registry[Any]] = {
+    "descriptor": descriptor,
+    "matcher": matcher,
+    "filter": outlier_filter,
+    "estimator": estimator,
+    "scorer": scorer,
+    "refiner": refiner,
+}
+"""The parts of every kind, by the kind's name."""
 
 Clouds = tuple[PreparedCloud, PreparedCloud]
 Places = tuple[FloatArray, FloatArray] | None

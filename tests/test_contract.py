@@ -47,9 +47,16 @@ def test_importing_is_quiet_and_loads_nothing_heavy():
     assert not loaded & (HEAVY | {"numpy", "pydantic"})
 
 
-def test_importing_takes_less_than_half_a_second():
-    code = "import time; start = time.perf_counter(); import geomoe3d; print(time.perf_counter() - start)"
-    assert min(float(in_a_fresh_python(code).stdout) for _ in range(3)) < 0.5
+def test_importing_takes_less_time_than_importing_numpy():
+    """Beside each other in one test: how long either takes is the machine's affair."""
+
+    def seconds(module):
+        code = (
+            f"import time; start = time.perf_counter(); import {module}; print(time.perf_counter() - start)"
+        )
+        return min(float(in_a_fresh_python(code).stdout) for _ in range(3))
+
+    assert seconds("geomoe3d") < seconds("numpy")
 
 
 def test_light_names_stay_light():

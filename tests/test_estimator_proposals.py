@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from corner_scenes import VOXEL, scene
 
+from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.proposals import propose
@@ -21,11 +22,9 @@ def test_proposals_take_a_second_round_from_mutual_matches() -> None:
     def run(estimator: EstimatorConfig, mutual: Any) -> int:
         found = propose(
             ConsensusEstimator(num_hypotheses=3),
-            Correspondences(rows, mutual=mutual),
+            Pair(Correspondences(rows, mutual=mutual), VOXEL, 2 * VOXEL),
             np.ones(len(rows)),
             estimator,
-            inlier_threshold=2 * VOXEL,
-            seed=0,
         )
         return len(found)
 

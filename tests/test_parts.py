@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -168,7 +169,7 @@ def test_source_hash_covers_what_a_module_imports_however_far() -> None:
         "types",
     ):
         assert f"geomoe3d.{name}" in closure
-    for name in ("cli.main", "visual.page", "evaluation.methods", "training.trainer", "doctor"):
+    for name in ("cli.main", "evaluation.methods", "training.trainer", "doctor"):
         assert f"geomoe3d.{name}" not in closure
     assert "geomoe3d.networks.aligned" in source_closure("geomoe3d.networks.motion_judge")
     assert source_hash("geomoe3d.types") != source_hash("geomoe3d.errors")
@@ -235,6 +236,13 @@ def test_examples_register_the_sample_pair_from_the_command_line(tmp_path, optio
     assert rotation_error_deg(np.array(result["T_target_source"]), truth) < 2
     if "--scorer" in options:
         assert result["config"]["scoring"]["scorers"] == ["surfaces", "examples/scorer.py:Near"]
+
+
+@pytest.mark.parametrize("verb", ["register", "batch", "multiway"])
+def test_every_verb_that_registers_pairs_takes_parts(verb: str) -> None:
+    command = importlib.import_module(f"geomoe3d.cli.{verb}").command
+    options = {option for parameter in command.params for option in parameter.opts}
+    assert {"--descriptor", "--matcher", "--filter", "--estimator", "--scorer", "--refiner"} <= options
 
 
 def test_examples_are_short() -> None:

@@ -9,6 +9,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
+from geomoe3d.cli.parts import part_options
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
@@ -37,6 +38,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
     multiple=True,
     help="One value of the configuration; repeatable.",
 )
+@part_options
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
 @click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
 @click.option("--fresh", is_flag=True, help="Delete the results of an earlier batch in OUT first.")
@@ -57,6 +59,7 @@ def command(
     seed: str | None,
     config_file: str | None,
     assignments: tuple[str, ...],
+    parts: list[str],
     transforms: bool,
     page: bool,
     fresh: bool,
@@ -77,7 +80,7 @@ def command(
 
     named = {"voxel_size": voxel_size, "seed": seed}
     given = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(config_file, [*assignments, *given])
+    config = load_config(config_file, [*assignments, *given, *parts])
     from geomoe3d.batch.run import ALL_THAT_FIT, register_pairs
 
     with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:

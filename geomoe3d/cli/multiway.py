@@ -9,6 +9,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
+from geomoe3d.cli.parts import part_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ _SHOWN = 20
     multiple=True,
     help="One value of the configuration; repeatable.",
 )
+@part_options
 @click.option("--sequence", is_flag=True, help="The scans are in the order in which they were taken.")
 @click.option(
     "--initial",
@@ -97,6 +99,7 @@ def command(
     seed: str | None,
     config_file: str | None,
     assignments: tuple[str, ...],
+    parts: list[str],
     page: bool,
     sequence: bool,
     initial: str | None,
@@ -122,7 +125,7 @@ def command(
         raise click.UsageError(f"--model-voxel-size must be positive, found {model_voxel_size}")
     named = {"voxel_size": voxel_size, "seed": seed}
     given = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(config_file, [*assignments, *given])
+    config = load_config(config_file, [*assignments, *given, *parts])
     from geomoe3d.batch.run import ALL_THAT_FIT
     from geomoe3d.multiway.run import register_scans
 

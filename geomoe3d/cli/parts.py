@@ -27,9 +27,11 @@ def part_options(command: Command) -> Command:
 
     @wraps(command)
     def with_parts(*args: Any, **named: Any) -> Any:
-        given = {key: named.pop(f"part_{option}") for option, key, _ in _PARTS}
+        given = [(option, key, named.pop(f"part_{option}")) for option, key, _ in _PARTS]
+        given = [(option, key, value) for option, key, value in given if value is not None]
         scorers = named.pop("part_scorers")
-        named["parts"] = [f"{key}={value}" for key, value in given.items() if value is not None]
+        _check([(option, value) for option, _, value in given] + [("scorer", name) for name in scorers])
+        named["parts"] = [f"{key}={value}" for _, key, value in given]
         if scorers:
             named["parts"].append(f"scoring.scorers=[{', '.join(scorers)}]")
         return command(*args, **named)
@@ -45,3 +47,16 @@ def part_options(command: Command) -> Command:
         wrapped = click.option(f"--{option}", f"part_{option}", metavar="NAME", help=text)(wrapped)
     result: Command = wrapped
     return result
+
+
+def _check(names: list[tuple[str, str]]) -> None:
+    """Whether there are such parts, before anything is read; nothing is loaded where none is named.
+
+    Raises:
+        ConfigError: there is none of a name.
+    """
+    if names:
+        from geomoe3d.pipeline import REGISTRIES
+
+        for option, name in names:
+            REGISTRIES[option].find(name)

@@ -279,3 +279,33 @@ def test_points_that_cannot_be_saved(
 def test_npy_refuses_what_it_cannot_name(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"\.npz"):
         save_points(tmp_path / "a.npy", small_cloud(), normals=small_cloud())
+
+
+def test_a_moved_obj_keeps_its_texture(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    from PIL import Image
+
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out").mkdir()
+    Image.new("RGB", (2, 2), (10, 200, 30)).save(tmp_path / "in" / "t.png")
+    (tmp_path / "in" / "a.mtl").write_text("newmtl paint\nmap_Kd t.png\n")
+    body = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 2 0 1 0 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\n"
+    text = f"# by hand\nmtllib a.mtl\no thing\n{body}usemtl paint\nf 1/1/1 2/2/1 3/3/1\n"
+    (tmp_path / "in" / "a.obj").write_text(text)
+    notes: list[str] = []
+    for folder in ("in", "out"):
+        source = tmp_path / "in" / "a.obj"
+        assert save_aligned(tmp_path / folder / "b.obj", source, rigid(), remark=notes.append) == ()
+    assert len(notes) == 1 and "materials" in notes[0] and str(tmp_path / "in") in notes[0]
+    assert "mtllib ../in/a.mtl\n" in (tmp_path / "out" / "b.obj").read_text()
+    lines = (tmp_path / "in" / "b.obj").read_text().splitlines()
+    assert lines[1] == "mtllib a.mtl"
+    assert lines[2] == "o thing" and lines[-2:] == ["usemtl paint", "f 1/1/1 2/2/1 3/3/1"]
+    np.testing.assert_allclose(np.array(lines[9].split()[1:], float), rigid()[:3, 2], atol=1e-15)
+    assert lines[3].split()[4:] == ["1", "0", "0"]
+    found = trimesh.load(tmp_path / "in" / "b.obj", process=False)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]])
+    np.testing.assert_allclose(found.vertices, transform_points(rigid(), corners), atol=1e-12)
+    assert found.visual.material.image.convert("RGB").getpixel((0, 0)) == (10, 200, 30)
+    lost = save_aligned(tmp_path / "c.ply", tmp_path / "in" / "a.obj", rigid())
+    assert lost == ("texture coordinates", "normals", "materials")

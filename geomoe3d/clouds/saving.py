@@ -210,6 +210,8 @@ def _save_aligned(
         read_raw(file)  # refuses what is damaged
         whole = gltf.moved_glb(file, T) if suffix == ".glb" else meshes.moved_obj(file, T, path)
         _write(path, lambda handle: handle.write(whole), force)
+        if suffix == ".obj" and b"mtllib" in whole and file.resolve().parent != path.resolve().parent:
+            remark(f"{path} takes its materials from {file.resolve().parent}; move them along with it")
         return ()
     what = describe(source)
     raw, _ = finite_part(read_raw(source), what)

@@ -254,7 +254,7 @@ def moved_obj(path: Path, T: FloatArray, to: Path) -> bytes:
     for k, line in enumerate(lines):
         if line.startswith("mtllib "):
             library = path.resolve().parent / line[7:].strip()
-            lines[k] = f"mtllib {os.path.relpath(library, to.resolve().parent)}"
+            lines[k] = f"mtllib {Path(os.path.relpath(library, to.resolve().parent)).as_posix()}"
     return "\n".join(lines).encode("latin-1", errors="replace")
 
 

@@ -13,6 +13,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.evaluation.benchmarks import load_pairs
 from geomoe3d.evaluation.tracks import TRACKS, InputMaker
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.sources import source_closure, source_hash
 
 
 @pytest.mark.parametrize("track", TRACKS)
@@ -43,6 +44,9 @@ def test_matched_input_depends_on_the_code_that_matches(posed_folder: Path) -> N
     keys = {track: set(InputMaker(track, str(posed_folder)).identity(pairs)) for track in TRACKS}
     assert keys["clouds"] == {"from", "files_sha256"}
     assert {"source_sha256", "preparation", "versions"} < keys["all"] == keys["1k"]
+    known = InputMaker("all", str(posed_folder)).identity(pairs)["source_sha256"]
+    assert known == [source_hash(name) for name in ("geomoe3d.data.describe", "geomoe3d.matching.nearest")]
+    assert "geomoe3d.features.fpfh" in source_closure("geomoe3d.data.describe")
 
 
 def test_published_pairs_and_their_fixed_correspondences() -> None:

@@ -21,22 +21,18 @@ run, not what it imports. Cost: that of the function and one copy of its input.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import importlib
-import importlib.util
 import inspect
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.errors import ConfigError, GeoMoE3DError, InputError
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import check_motion
+from geomoe3d.parts import load_object
 from geomoe3d.types import FloatArray
 
 _KEYWORDS = ("seed", "voxel_size", "inlier_threshold")
@@ -57,13 +53,17 @@ class AdaptedFunction:
 
     def __init__(self, spec: str) -> None:
         self.name = spec
-        place, _, function = spec.rpartition(":")
-        if not place or not function:
+        if not all(spec.rpartition(":")[::2]):
             raise InputError(f"'{spec}' names no function; write file.py:function or package.module:function")
-        module = _load_file(place) if place.endswith(".py") else _import(place)
-        self._function = _find(module, function, place)
-        self._source_hash = _hash(module)
-        self._keywords = _accepted(self._function)
+        try:
+            found = load_object(spec, "a method")
+        except ConfigError as error:
+            raise InputError(str(error)) from error.__cause__
+        if not callable(found):
+            raise InputError(f"'{spec}' is a {type(found).__name__}, not a function")
+        self._function = found
+        self._source_hash = _hash(found)
+        self._keywords = _accepted(found)
 
     def identity(self) -> dict[str, Any]:
         """The function, the hash of its file, and the version of numpy."""
@@ -119,50 +119,6 @@ def _motion(result: Any, who: str) -> FloatArray | None:
         raise InputError(f"{who} returned {_kind(result)}: {error}") from None
 
 
-def _load_file(place: str) -> ModuleType:
-    """The module in a file; its folder joins the search path, so that it finds its neighbours."""
-    path = Path(place).resolve()
-    if not path.is_file():
-        raise InputError(f"no file '{place}' to take a method from")
-    digest = hashlib.sha256(str(path).encode()).hexdigest()[:12]
-    name = f"geomoe3d_method_{path.stem}_{digest}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise InputError(f"'{place}' cannot be imported as Python")
-    module = importlib.util.module_from_spec(spec)
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))
-    sys.modules[name] = module  # dataclasses and pickle look their module up
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        del sys.modules[name]
-        raise InputError(f"'{place}' fails as it is imported: {type(error).__name__}: {error}") from error
-    return module
-
-
-def _import(place: str) -> ModuleType:
-    try:
-        return importlib.import_module(place)
-    except (Exception, SystemExit) as error:
-        raise InputError(
-            f"module '{place}' cannot be imported: {type(error).__name__}: {error}; for a file of your own "
-            "write its path, e.g. ./mine.py:register"
-        ) from error
-
-
-def _find(module: ModuleType, function: str, place: str) -> Callable[..., Any]:
-    found: Callable[..., Any] | None = getattr(module, function, None)
-    if callable(found):
-        return found
-    if found is not None:
-        raise InputError(f"'{function}' in '{place}' is a {type(found).__name__}, not a function")
-    names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-    close = difflib.get_close_matches(function, names, n=1, cutoff=0.4)
-    hint = f"did you mean '{close[0]}'?" if close else f"it holds: {', '.join(names) or 'none'}"
-    raise InputError(f"'{place}' holds no function '{function}'; {hint}")
-
-
 def _accepted(function: Callable[..., Any]) -> tuple[str, ...]:
     """Which of the keywords the function names; none where it has no readable signature."""
     try:
@@ -174,8 +130,9 @@ def _accepted(function: Callable[..., Any]) -> tuple[str, ...]:
     return tuple(name for name in _KEYWORDS if name in names)
 
 
-def _hash(module: ModuleType) -> str | None:
-    file = getattr(module, "__file__", None)
+def _hash(function: Callable[..., Any]) -> str | None:
+    """Of the file that the function was found in; None for one that was not written in a file."""
+    file = getattr(inspect.getmodule(function), "__file__", None)
     return None if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 

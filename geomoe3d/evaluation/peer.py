@@ -8,14 +8,12 @@ these libraries compute in single precision. Place: below `peers` and `open3d_pe
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.util
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import make_transform, project_to_so3, shift_frames
+from geomoe3d.runtime.sources import source_hash
 
 CORRESPONDENCES = frozenset({"correspondences"})
 CLOUDS = frozenset({"clouds"})
@@ -68,12 +67,11 @@ class Peer:
         return replace(self, settings={**self.settings, **changes})
 
     def identity(self) -> dict[str, Any]:
-        """Settings, versions of the libraries, and the hash of the files that define the peer."""
-        files = [Path(__file__), Path(inspect.getfile(self.register))]
+        """Settings, versions of the libraries, and the hash of the code that defines the peer."""
         return {
             "settings": self.settings,
             "versions": versions("numpy", *self.distributions),
-            "source_sha256": hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest(),
+            "source_sha256": source_hash(self.register.__module__),
         }
 
     def absent(self) -> str | None:

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-import geomoe3d
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.collection import load_fragment
 from geomoe3d.data.describe import describe_fragment
@@ -28,6 +27,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.evaluation.peer import versions
 from geomoe3d.evaluation.records import VOXEL_SIZE, EvaluationPair, MethodInput
 from geomoe3d.matching.nearest import nearest_features
+from geomoe3d.runtime.sources import source_hash
 from geomoe3d.types import Float32Array, FloatArray
 
 TRACKS = ("1k", "all", "clouds")
@@ -79,13 +79,10 @@ class InputMaker:
         if self._published is not None:
             files = {self._published / f"{pair.scene}.npz" for pair in pairs}
             return {"from": "published 1k correspondences", "files_sha256": _hash_files(files)}
-        package = Path(geomoe3d.__file__).parent
-        code = {package / "data" / "describe.py", package / "data" / "collection.py"}
-        code |= {file for part in ("clouds", "geometry") for file in (package / part).rglob("*.py")}
         return {
             "from": "matched on a 5 cm grid",
             "files_sha256": _hash_files(files),
-            "source_sha256": _hash_files(code),
+            "source_sha256": [source_hash(made.__module__) for made in (describe_fragment, nearest_features)],
             "preparation": PreparationConfig().model_dump(mode="json"),
             "versions": versions("numpy", "scipy", "open3d-cpu", "open3d"),
         }

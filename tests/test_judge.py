@@ -351,3 +351,25 @@ def test_a_rival_makes_ambiguous_only_where_clouds_and_network_like_it_alike(
     rival = scored(evidence(surface, overlap=0.5), verdicts[1])
     judged = confidence.judge(mine, rival, 5.0, 0.3, FIRM, DecisionConfig(min_confidence=0.5))
     assert judged.status == status
+
+
+# ---- verdicts that do not hang on the last bits ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_statuses_survive_points_that_move_by_a_millionth(seed: int) -> None:
+    """Another processor rounds otherwise; a millionth of the extent is far more than that."""
+    source, target, T = make_sample_pair(0)
+    half_turn = np.diag([-1.0, 1, -1, 1])
+    twice = np.vstack([target.file_points, transform_points(half_turn, target.file_points)])
+    rng = np.random.default_rng(seed)
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return points + rng.normal(0, 1e-6 * np.ptp(points, axis=0).max(), points.shape)
+
+    answer = geomoe3d.register(moved(source.file_points), moved(target.file_points))
+    assert answer.status == "ok"
+    assert rotation_error_deg(answer.T_target_source, T) < 1
+    answer = geomoe3d.register(moved(source.file_points), moved(twice), voxel_size=0.07)
+    assert answer.status == "ambiguous"
+    assert min(rotation_error_deg(answer.T_target_source, place) for place in (T, half_turn @ T)) < 1

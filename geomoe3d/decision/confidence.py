@@ -37,7 +37,7 @@ _MOST_LEAD = 30.0
 _MOST_VIOLATION = 0.1
 UNRIVALLED_LEAD = 3.0
 _LIKELY = 0.5
-_CLOSE_VERDICTS = 2.0  # odds of seven to one
+_CLOSE_VERDICTS = 5.0  # of two places that are both right the network has preferred one by up to 3
 _LEAST_OBSERVABILITY = 0.005
 _LOW_OVERLAP = 0.1
 

@@ -42,5 +42,11 @@ if "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
 else
   say "mypy is left out: the numpy whose types the code is checked against needs Python 3.11"
 fi
+if [ $# -eq 0 ]; then
+  say "pytest, the numbers that must not hang on the processor, by a narrow instruction set"
+  bash scripts/narrow.sh narrowest "$python" -m pytest -q tests/test_choice.py tests/test_consensus.py \
+    tests/test_judge.py tests/test_motion_judge.py tests/test_multiway_grouping.py tests/test_network_folded.py \
+    tests/test_registration.py
+fi
 say "pytest"
 exec "$python" -m pytest "$@"

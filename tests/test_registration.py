@@ -360,5 +360,5 @@ def test_a_section_given_as_a_word_is_explained(pair):
 def test_results_can_be_compared_and_kept_in_sets(answer):
     assert answer == answer
     assert len({answer, answer.inverse()}) == 2
-    with pytest.raises(InputError, match=r"found a str; geomoe3d\.load_points"):
+    with pytest.raises(InputError, match=r"found the path 'a.ply'.*geomoe3d\.load_points"):
         answer.apply("a.ply")

@@ -112,6 +112,17 @@ def test_organised_and_structured_arrays(tmp_path: Path) -> None:
     fails(np.zeros(5, [("a", "f8")]), "fields a", error=InputError)
 
 
+def test_columns_without_names_keep_their_type(tmp_path: Path) -> None:
+    """x y z intensity ring time, as lidar users have it."""
+    table = np.column_stack([small_cloud(50), np.arange(50) % 7, np.arange(50) % 3, np.linspace(0, 0.1, 50)])
+    np.save(tmp_path / "a.npy", table.astype(np.float32))
+    cloud = read_raw(tmp_path / "a.npy")
+    assert cloud.colors is None and cloud.normals is None
+    for k in (4, 5, 6):
+        assert cloud.fields[f"column_{k}"].dtype == np.float32
+        assert np.array_equal(cloud.fields[f"column_{k}"], table[:, k - 1].astype(np.float32))
+
+
 def test_arrays_beside_the_points_are_fields(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", points=small_cloud(5), ring=np.arange(5), K=np.eye(3))
     cloud = read_raw(tmp_path / "a.npz")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -151,7 +152,10 @@ def table_cloud(
         wanted = "(N, 3), (H, W, 3) or more columns behind x, y and z" if columns else "(N, 3) or (H, W, 3)"
         raise error(f"{what} has shape {array.shape}, expected {wanted}{_shape_hint(array)}")
     table: FloatArray = np.array(array, dtype=np.float64, order="C")
-    return RawCloud(table, unread=grid) if array.shape[1] == 3 else split_columns(table, None, what)
+    if array.shape[1] == 3:
+        return RawCloud(table, unread=grid)
+    cloud = split_columns(table, None, what)
+    return replace(cloud, fields={name: column.astype(array.dtype) for name, column in cloud.fields.items()})
 
 
 def _shape_hint(array: NDArray[Any]) -> str:

@@ -102,7 +102,7 @@ def cloud_of(
     groups = columns_by_name(names)
     with np.errstate(invalid="ignore"):  # signalling NaNs are dropped later
         parts = {
-            group: np.stack([np.asarray(columns[k], dtype=_KIND.get(group)) for k in chosen], axis=1)
+            group: _side_by_side([columns[k] for k in chosen], _KIND.get(group))
             for group, chosen in groups.items()
         }
     colors = scale_colors(parts["colors"]) if "colors" in parts else None
@@ -123,6 +123,14 @@ def cloud_of(
         fields,
         unread,
     )
+
+
+def _side_by_side(columns: Sequence[NDArray[Any]], kind: Any) -> NDArray[Any]:
+    """Columns (N,) as (N, C), of a given type or that of all."""
+    table: NDArray[Any] = np.empty((len(columns[0]), len(columns)), dtype=kind or np.result_type(*columns))
+    for k, column in enumerate(columns):
+        table[:, k] = column
+    return table
 
 
 def split_columns(table: FloatArray, names: Sequence[str] | None, what: str) -> RawCloud:

@@ -43,19 +43,28 @@ class DataLines:
 
     numpy's parser asks for one line at a time, so when it fails the last line handed out is the guilty one.
 
+    Args:
+        lines: of a text.
+        number: how many lines of the file came before.
+        comments: what a line that is passed over begins with.
+        odd: whether numbers may be written as `plain` undoes it.
+
     Attributes:
         number: 1-based number of the last line in its file.
         text: its text.
         taken: data lines handed out so far, or since `begin`.
     """
 
-    def __init__(self, lines: Iterable[str], number: int = 0, comments: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, lines: Iterable[str], number: int = 0, comments: tuple[str, ...] = (), odd: bool = True
+    ) -> None:
         self.number = number
         self.text = ""
         self.taken = 0
         self._limit: int | None = None
         self._lines = iter(lines)
         self._comments = comments
+        self._odd = odd
 
     def begin(self, limit: int) -> None:
         """Start a section of at most ``limit`` data lines."""
@@ -80,7 +89,7 @@ class DataLines:
             self.text = line.strip()
             if self.text and not self.text.startswith(self._comments):
                 self.taken += 1
-                return plain(self.text)
+                return plain(self.text) if self._odd else self.text
         raise StopIteration
 
     def where(self, path: Path) -> str:
@@ -169,8 +178,14 @@ def read_text(path: Path) -> RawCloud:
         FormatError: a line that does not parse (named), fewer than three columns, or a number of points that
             the file does not hold.
     """
-    with _open_text(path) as handle:
-        return _read_table(path, handle)
+    try:
+        with _open_text(path) as handle:
+            return _read_table(path, handle, False)
+    except (
+        FormatError
+    ):  # perhaps for numbers that are not written as Python does, which costs time to look for
+        with _open_text(path) as handle:
+            return _read_table(path, handle, True)
 
 
 def _open_text(path: Path) -> IO[str]:
@@ -179,7 +194,7 @@ def _open_text(path: Path) -> IO[str]:
     return path.open(encoding="utf-16" if wide else "utf-8-sig", errors="replace")
 
 
-def _read_table(path: Path, handle: IO[str]) -> RawCloud:
+def _read_table(path: Path, handle: IO[str], odd: bool) -> RawCloud:
     header: list[str] | None = None
     remark: list[str] | None = None  # a comment that reads like a header; it counts if its length fits
     counts: list[int] = []
@@ -218,7 +233,7 @@ def _read_table(path: Path, handle: IO[str]) -> RawCloud:
     words = [k for k, token in enumerate(tokens) if not _is_number(token)] if header is not None else []
     kept = [k for k in range(len(tokens)) if k not in words]
     again = _cleaned(chain([lines.text], handle), delimiter, body.endswith(delimiter or "\n"), counts)
-    rest = DataLines(again, lines.number - 1, _COMMENTS)
+    rest = DataLines(again, lines.number - 1, _COMMENTS, odd)
     table = parse_table(path, rest, delimiter, len(tokens), kept if words else None)
     if counts and sum(counts) != len(table):
         raise wrong_count(path, sum(counts), len(table))

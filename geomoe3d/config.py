@@ -298,10 +298,10 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(_shipped(Path(path)).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        names = ", ".join(str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml")))
-        raise MissingConfigError(
-            f"cannot read configuration '{path}': {error.strerror}; those that come with geomoe3d: {names}"
-        ) from None
+        names = [str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml"))]
+        close = difflib.get_close_matches(str(path), names, n=1, cutoff=0.75)
+        hint = f"; did you mean {close[0]}, which comes with geomoe3d?" if close else ""
+        raise MissingConfigError(f"cannot read configuration '{path}': {error.strerror}{hint}") from None
     except OSError as error:
         raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -246,6 +247,15 @@ def test_register_many_goes_on_when_asked_to(files):
         list(Registrar(CONFIG).register_many(pairs))
     with pytest.raises(geomoe3d.InputError, match="raise or return"):
         next(Registrar(CONFIG).register_many(pairs, on_error="skip"))
+
+
+def test_threads_of_one_process_give_the_same_answers(result, files):
+    registrar = Registrar(CONFIG)
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda _: registrar.register(*map(str, files)), range(3)))
+    for one in found:
+        assert one.T_target_source.tobytes() == result.T_target_source.tobytes()
+        assert one.confidence == result.confidence
 
 
 # ---- batches and progress ------------------------------------------------------------------------------

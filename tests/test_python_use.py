@@ -70,6 +70,7 @@ def test_a_notebook_shows_words_and_clouds_to_turn(result):
         "<script" not in shown
     )  # escaped into the attribute of the frame, where it cannot touch the notebook
     assert len(shown) < 400_000
+    assert type(shown) is str
 
 
 def test_a_notebook_shows_words_alone_where_the_clouds_are_gone(result):

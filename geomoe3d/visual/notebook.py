@@ -26,4 +26,9 @@ def notebook_html(status: str, words: str, view: RegistrationView | None) -> str
     """
     color, rest = STATUS_COLORS[status], words.removeprefix(status)
     text = Markup('<p><b style="color:{}">{}</b>{}</p>').format(color, STATUS_WORDS[status], rest)
-    return text if view is None else text + Markup(_FRAME).format(render_page(view, max_points=MAX_POINTS))
+    # Plain text: what is added to Markup would be escaped, in the hands of a user too.
+    return (
+        str(text)
+        if view is None
+        else str(text + Markup(_FRAME).format(render_page(view, max_points=MAX_POINTS)))
+    )

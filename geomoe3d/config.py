@@ -123,7 +123,7 @@ class ScoringConfig(Section):
     scorers: tuple[str, ...] | Literal["auto"] = Field(
         "auto",
         description="surfaces: how well the clouds lie on each other; network: what a trained network says of "
-        "the best few; classes of your own. auto: surfaces, and network where torch is installed. []: none, "
+        "the best few; classes of your own. auto: surfaces, and the network that ships. []: none, "
         "the estimator's first hypothesis is the answer",
     )
     weights: str | None = Field(

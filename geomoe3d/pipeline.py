@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -215,9 +214,8 @@ def _check_weights_are_wanted(config: RegistrationConfig) -> None:
 
 
 def _resolved_scoring(config: ScoringConfig) -> ScoringConfig:
-    """The network is taken where weights are given, and where its libraries are installed and weights ship."""
+    """The network is taken where weights are given or ship with the package."""
     if config.scorers != "auto":
         return config
-    installed = all(importlib.util.find_spec(name) is not None for name in ("torch", "safetensors"))
-    usable = config.weights is not None or (installed and DEFAULT_WEIGHTS in packaged_names())
+    usable = config.weights is not None or DEFAULT_WEIGHTS in packaged_names()
     return config.model_copy(update={"scorers": ("surfaces", "network") if usable else ("surfaces",)})

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from geomoe3d.networks.architecture import NetworkConfig
@@ -68,7 +69,7 @@ def network() -> GeoMoE:
 
 def inference(sizes: tuple[int, ...], repeats: int, clock: Callable[[], float]) -> None:
     model = network()
-    folded = FoldedGeoMoE(model)
+    folded = FoldedGeoMoE.of(model)
     square = torch.randn(SQUARE, SQUARE)
     stronger = NetworkConfig(**STRONGER)
     print(f"\ninference, batch 1, {num_parameters(model):,} parameters, milliseconds")
@@ -81,7 +82,8 @@ def inference(sizes: tuple[int, ...], repeats: int, clock: Callable[[], float]) 
         points = (torch.rand(num, 6) * 3).numpy()
         with torch.no_grad():
             plain_logits = model(x, None, neighbors).logits[:, 0]
-        difference = float((folded(x[0], None, neighbors[0]).logits - plain_logits).abs().max())
+        rows, near = x[0].numpy(), neighbors[0].numpy()
+        difference = float(np.abs(folded(rows, None, near).logits - plain_logits.numpy()).max())
 
         def plain(x: torch.Tensor = x, neighbors: torch.Tensor = neighbors) -> None:
             with torch.no_grad():
@@ -90,7 +92,7 @@ def inference(sizes: tuple[int, ...], repeats: int, clock: Callable[[], float]) 
         jobs: dict[str, Callable[[], object]] = {
             "square": lambda: square @ square,
             "plain": plain,
-            "folded": lambda x=x, n=neighbors: folded(x[0], None, n[0]),  # type: ignore[misc]
+            "folded": lambda x=rows, n=near: folded(x, None, n),  # type: ignore[misc]
             "knn": lambda x=x: find_neighbors(x, model.config),  # type: ignore[misc]
             "inputs": lambda p=points: pair_input(p, 0.05, stronger),  # type: ignore[misc]
         }
@@ -178,11 +180,11 @@ def child(job: str) -> float:
         def step() -> None:
             pair_input(points, 0.05, NetworkConfig(**STRONGER))
     else:
-        folded = FoldedGeoMoE(network())
+        folded = FoldedGeoMoE.of(network())
         x = torch.randn(1, int(numbers[0]), 6)
 
         def step() -> None:
-            folded(x[0], None, find_neighbors(x, folded.config)[0])
+            folded(x[0].numpy(), None, find_neighbors(x, folded.config)[0].numpy())
 
     before = peak_mib()
     step()

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from geomoe3d.networks.build import Network, build_network
-from geomoe3d.networks.pretrained import WeightCard, load_network, save_pretrained
-from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, PACKAGED
+from geomoe3d.networks.pretrained import load_network, save_pretrained
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, PACKAGED, WeightCard
 from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.batches import open_training
 from geomoe3d.training.checkpoint import load_checkpoint

@@ -14,7 +14,8 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.networks.aligned import CHANNELS, AlignedChannels
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.geomoe import GeoMoE
-from geomoe3d.networks.inputs import MotionInputs, collate
+from geomoe3d.networks.inputs import collate, under_motions
+from geomoe3d.networks.motion_inputs import MotionInputs
 from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import FloatArray
 
@@ -37,7 +38,9 @@ def network(**changes: object) -> GeoMoE:
     torch.manual_seed(0)
     model = GeoMoE(build_config(NetworkConfig, {**SMALL, **changes})).train()
     rows, T = scene()
-    batch = collate(MotionInputs(rows, (None, None), VOXEL, model.config).under(T[None].repeat(3, 0)))
+    batch = collate(
+        under_motions(MotionInputs(rows, (None, None), VOXEL, model.config), T[None].repeat(3, 0))
+    )
     model(batch.coordinates, batch.channels, batch.neighbors)
     return model.eval()
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.geometry.se3 import make_transform, transform_points
-from geomoe3d.networks.aligned import CHANNELS
+from geomoe3d.networks.aligned import CHANNELS, PRIOR_KERNEL
 from geomoe3d.networks.architecture import CHANNEL_WIDTHS, NetworkConfig
-from geomoe3d.networks.geomoe import PRIOR_KERNEL
+from geomoe3d.networks.folded import FoldedGeoMoE
 from geomoe3d.networks.inputs import pair_input
 from geomoe3d.networks.motion_judge import MotionJudge
 from geomoe3d.types import Correspondences
@@ -76,7 +76,12 @@ def test_the_first_prior_keeps_what_the_motion_brings_together() -> None:
 def test_no_motions_are_no_channels() -> None:
     rows, _ = scene()
     assert aligned(rows, np.zeros((0, 4, 4))).shape == (0, 300, len(CHANNELS))
-    assert MotionJudge(network()).about(Correspondences(rows), voxel_size=VOXEL)(np.zeros((0, 4, 4))) == []
+    assert (
+        MotionJudge(FoldedGeoMoE.of(network())).about(Correspondences(rows), voxel_size=VOXEL)(
+            np.zeros((0, 4, 4))
+        )
+        == []
+    )
 
 
 @pytest.mark.parametrize("count", [300, 1700])

@@ -14,7 +14,8 @@ from geomoe3d.errors import ConfigError
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.build import build_network
 from geomoe3d.networks.counting import count_cost, num_parameters
-from geomoe3d.networks.pretrained import WeightCard, load_network, save_pretrained
+from geomoe3d.networks.pretrained import load_network, save_pretrained
+from geomoe3d.networks.weight_files import WeightCard
 from geomoe3d.training.losses import similarity_loss
 from geomoe3d.training.overfit import overfit_one_batch
 

@@ -12,7 +12,8 @@ from tiny_networks import SMALL, settle, small, tiny
 from geomoe3d.errors import CheckpointError
 from geomoe3d.filters.geomoe import GeoMoEFilter
 from geomoe3d.filters.network import NetworkFilter
-from geomoe3d.networks.pretrained import WeightCard, load_pretrained, save_pretrained
+from geomoe3d.networks.pretrained import load_pretrained, save_pretrained
+from geomoe3d.networks.weight_files import WeightCard
 from geomoe3d.training.synthetic import SyntheticConfig, SyntheticPairs
 from geomoe3d.types import Correspondences
 

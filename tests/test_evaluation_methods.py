@@ -157,7 +157,8 @@ def weights(tmp_path_factory):
     torch = pytest.importorskip("torch")
     from geomoe3d.networks.architecture import NetworkConfig
     from geomoe3d.networks.geomoe import GeoMoE
-    from geomoe3d.networks.pretrained import WeightCard, save_pretrained
+    from geomoe3d.networks.pretrained import save_pretrained
+    from geomoe3d.networks.weight_files import WeightCard
 
     made = {}
     for name, channels in (("plain", ()), ("other", ()), ("matching", ("ratio",))):
@@ -201,18 +202,24 @@ def test_missing_weights_are_refused_before_any_pair():
         make_method("geomoe3d", network(Path("nowhere.safetensors")))
 
 
-def test_network_without_torch_is_absent(monkeypatch):
+@pytest.mark.parametrize(
+    ("missing", "absent"), [("torch", {"geomoe-plain"}), ("safetensors", {"geomoe", "geomoe-plain"})]
+)
+def test_network_without_its_library_is_absent(missing, absent, monkeypatch):
     shipped = make_method("geomoe").identity()["parts"]["network"]["weights"]
     find = methods.importlib.util.find_spec
     monkeypatch.setattr(
         methods.importlib.util,
         "find_spec",
-        lambda name, *rest: None if name == "torch" else find(name, *rest),
+        lambda name, *rest: None if name == missing else find(name, *rest),
     )
-    method = make_method("geomoe")
-    assert "pip install torch" in method.absent()
-    assert method.identity()["parts"]["network"]["weights"] == shipped
-    assert make_method("geomoe3d").absent() is None
+    made = {name: make_method(name) for name in ("geomoe", "consensus")}
+    made["geomoe-plain"] = make_method("geomoe-plain", ["filter.weights=mine.safetensors"])
+    for name, method in made.items():
+        said = method.absent()
+        assert (said is not None) == (name in absent)
+        assert said is None or f"pip install {missing}" in said
+    assert made["geomoe"].identity()["parts"]["network"]["weights"] == shipped
 
 
 # ---- names and identities ---------------------------------------------------------------------------
@@ -257,7 +264,8 @@ def test_identities_differ_where_answers_may():
 def test_networks_with_weights_of_the_user_are_methods(name, tmp_path):
     from tiny_networks import settle, small, tiny
 
-    from geomoe3d.networks.pretrained import WeightCard, save_pretrained
+    from geomoe3d.networks.pretrained import save_pretrained
+    from geomoe3d.networks.weight_files import WeightCard
 
     path = tmp_path / "w.safetensors"
     network = settle(tiny() if name == "geomoe-plain" else small(name))

@@ -18,7 +18,8 @@ from geomoe3d.filters.geomoe import GeoMoEFilter
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.networks.inputs import collate, pair_input
-from geomoe3d.networks.pretrained import WeightCard, load_pretrained, read_card, save_pretrained
+from geomoe3d.networks.pretrained import load_pretrained, save_pretrained
+from geomoe3d.networks.weight_files import WeightCard, read_card
 from geomoe3d.training.synthetic import SyntheticConfig, SyntheticPairs
 from geomoe3d.types import Correspondences
 

@@ -71,6 +71,17 @@ def test_listing_names_loads_no_network_library() -> None:
     assert done.stdout.splitlines()[-1] == "False False"
 
 
+def test_the_shipped_network_scores_without_torch() -> None:
+    code = (
+        "import sys\nsys.modules['torch'] = None\nimport geomoe3d\nfrom geomoe3d.data.sample import make_sample_pair\n"
+        "from geomoe3d.registration import Registrar\n"
+        "source, target, _ = make_sample_pair(0)\nexplained = Registrar().explain(source, target)\n"
+        "print(explained.result.status, explained.weighed.weights.max() > 0.5)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "ok True"
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [

@@ -11,7 +11,8 @@ from geomoe3d.data.sample import make_sample_pair, write_sample_pair
 from geomoe3d.errors import CheckpointError
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.geomoe import GeoMoE
-from geomoe3d.networks.pretrained import WeightCard, save_pretrained
+from geomoe3d.networks.pretrained import save_pretrained
+from geomoe3d.networks.weight_files import WeightCard
 from geomoe3d.registration import Registrar
 
 

@@ -130,10 +130,11 @@ class OurMethod:
 
     def absent(self) -> str | None:
         """Whether a library that the network needs is missing, and how to install it."""
-        if NETWORK in self.config.scoring.scorers or self.config.filter.name == "geomoe":
-            for module in ("torch", "safetensors"):
-                if importlib.util.find_spec(module) is None:
-                    return f"the network needs {module}, which is not installed: pip install {module}"
+        weighs = self.config.filter.weights is not None
+        needed = {"torch": weighs, "safetensors": weighs or NETWORK in self.config.scoring.scorers}
+        for module in (name for name, wanted in needed.items() if wanted):
+            if importlib.util.find_spec(module) is None:
+                return f"the network needs {module}, which is not installed: pip install {module}"
         return None
 
     def __call__(self, given: MethodInput) -> Answer:

@@ -20,12 +20,11 @@ from geomoe3d.runtime.sources import source_hash
 from geomoe3d.types import Correspondences, FilterOutput
 
 if TYPE_CHECKING:
-    import torch
     from typing_extensions import Self
 
     from geomoe3d.networks.geomoe import GeoMoE
     from geomoe3d.networks.inference import Insight
-    from geomoe3d.networks.pretrained import WeightCard
+    from geomoe3d.networks.weight_files import WeightCard
 
 _MATCHING_CHANNELS = ("feature_distance", "ratio", "mutual")
 
@@ -37,7 +36,6 @@ class GeoMoEFilter(OutlierFilter):
     Args:
         model: trained, not one that judges transforms; its weights are copied.
         card: what it is, or None.
-        device: where it runs.
 
     Raises:
         CheckpointError: a network that judges transforms.
@@ -45,11 +43,7 @@ class GeoMoEFilter(OutlierFilter):
 
     takes_weights: ClassVar[bool] = True
 
-    def __init__(
-        self, model: GeoMoE, card: WeightCard | None = None, device: str | torch.device = "cpu"
-    ) -> None:
-        import torch
-
+    def __init__(self, model: GeoMoE, card: WeightCard | None = None) -> None:
         from geomoe3d.networks.folded import FoldedGeoMoE
 
         if model.config.judges_motions:
@@ -58,9 +52,8 @@ class GeoMoEFilter(OutlierFilter):
             )
         self.config = model.config
         self.card = card
-        self.device = torch.device(device)
         self.needs = frozenset(_MATCHING_CHANNELS) & frozenset(model.config.extra_channels)
-        self._network = FoldedGeoMoE(model.to(self.device).eval())
+        self._network = FoldedGeoMoE.of(model)
 
     @classmethod
     def from_config(cls, config: FilterConfig) -> Self:
@@ -79,7 +72,7 @@ class GeoMoEFilter(OutlierFilter):
         return cls.from_pretrained(config.weights)
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | Path, device: str | torch.device = "cpu") -> Self:
+    def from_pretrained(cls, name_or_path: str | Path) -> Self:
         """Load a .safetensors file with its card.
 
         Raises:
@@ -93,7 +86,7 @@ class GeoMoEFilter(OutlierFilter):
                 f"the filter 'geomoe' needs PyTorch ({error}); `geomoe3d doctor` gives the command that installs "
                 "it, or use --filter none"
             ) from error
-        return cls(*load_pretrained(name_or_path), device)
+        return cls(*load_pretrained(name_or_path))
 
     def identity(self) -> dict[str, Any]:
         """Architecture, hash of the weights, and hash of the code."""
@@ -117,8 +110,9 @@ class GeoMoEFilter(OutlierFilter):
 
     def look(self, correspondences: Correspondences, *, voxel_size: float) -> Insight:
         """What all layers say, sub-fields and experts, for drawing."""
-        from geomoe3d.networks.inference import Insight, finite_part, run
-        from geomoe3d.networks.inputs import MIN_CORRESPONDENCES, pair_input
+        from geomoe3d.networks.inference import Insight, finite_part
+        from geomoe3d.networks.inputs import pair_input
+        from geomoe3d.networks.motion_inputs import MIN_CORRESPONDENCES
 
         result = Insight.blind(len(correspondences), self.config.num_layers)
         seen, part = finite_part(correspondences)
@@ -126,5 +120,6 @@ class GeoMoEFilter(OutlierFilter):
             return result
         given: dict[str, NDArray[Any] | None] = {name: getattr(part, name) for name in sorted(self.needs)}
         inputs = pair_input(part.points, voxel_size, self.config, **given)
-        result.fill(seen, run(self._network, inputs, self.device))
+        channels = None if inputs.channels is None else inputs.channels.numpy()
+        result.fill(seen, self._network(inputs.coordinates.numpy(), channels, inputs.neighbors.numpy()))
         return result

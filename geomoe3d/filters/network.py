@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from geomoe3d.networks.build import Network
-    from geomoe3d.networks.pretrained import WeightCard
+    from geomoe3d.networks.weight_files import WeightCard
 
 _RUN_BY = "geomoe3d.networks.plain"
 

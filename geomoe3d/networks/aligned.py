@@ -12,6 +12,7 @@ Cost: about 10 ms, and 1 ms per motion, for 1,000 correspondences.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -45,6 +46,8 @@ CHANNELS = (
 """
 
 NUM_CHANNELS = len(CHANNELS)
+PRIOR_KERNEL = math.exp(-0.5 / 0.75**2)
+"""The channel ``residual`` at a residual of one inlier threshold: the network's first prior is what lies below."""
 _MOST_ANCHORS = 1000
 _ROWS_AT_ONCE = 250
 _REACH = 3.0  # inlier thresholds in which a surface point of the other scan is sought

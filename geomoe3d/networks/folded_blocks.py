@@ -1,169 +1,262 @@
-"""Folded parts of GeoMoE that see only the M sub-fields, and how norms are folded into weights.
+"""Folded parts of GeoMoE that see only the M sub-fields, and how norms are folded into weights; numpy alone.
 
 Used by `geomoe3d.networks.folded`; everything here works on one pair under B motions, (B, C, M) or (B, C, N).
 """
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from collections.abc import Mapping
+from typing import Any
 
-from geomoe3d.networks.blocks import GraphAttention, TwoLayer
-from geomoe3d.networks.layers import BiPathRectifier, ChannelPath, FeedForward
-from geomoe3d.networks.moe import DenseFeedForward, FMoE, expert_weights
-from geomoe3d.networks.norms import BatchNorm, ContextNorm
+import numpy as np
+from numpy.typing import NDArray
 
+from geomoe3d.errors import CheckpointError
+from geomoe3d.networks.architecture import BATCH_NORM_EPS, CONTEXT_NORM_EPS, NetworkConfig
+from geomoe3d.types import Float32Array, FloatArray, IntArray
 
-def affine(module: torch.nn.Conv1d) -> tuple[Tensor, Tensor]:
-    """Weight (out, in) and bias (out, 1) of a 1x1 convolution."""
-    assert module.bias is not None
-    return module.weight.detach()[:, :, 0].clone(), module.bias.detach()[:, None].clone()
-
-
-def scale_shift(norm: BatchNorm) -> tuple[Tensor, Tensor]:
-    """A batch norm in evaluation as x * scale + shift, each (C, 1)."""
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    scale = norm.weight.detach() * torch.rsqrt(norm.running_var + norm.eps)
-    return scale[:, None].clone(), (norm.bias.detach() - norm.running_mean * scale)[:, None].clone()
+Affine = tuple[FloatArray, FloatArray]
+"""Weight (out, in) and bias (out, 1)."""
 
 
-def two_layer(module: TwoLayer) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Two weights and biases, the norm between them folded into the first."""
-    weight, bias = affine(module.linear1)
-    scale, shift = scale_shift(module.norm)
-    return (weight * scale, bias * scale + shift, *affine(module.linear2))
+class Tensors:
+    """Tensors of a trained network by name, in double precision for folding; notes which were asked for.
+
+    Args:
+        tensors: as `torch.nn.Module.state_dict` names them.
+    """
+
+    def __init__(self, tensors: Mapping[str, NDArray[Any]]) -> None:
+        self._tensors, self._left, self._prefix = tensors, set(tensors), ""
+
+    def at(self, name: str) -> Tensors:
+        """Those of one part."""
+        part = Tensors({})
+        part._tensors, part._left, part._prefix = self._tensors, self._left, f"{self._prefix}{name}."
+        return part
+
+    def array(self, name: str, *shape: int) -> FloatArray:
+        """One tensor.
+
+        Raises:
+            CheckpointError: missing or of another shape.
+        """
+        name = self._prefix + name
+        found = self._tensors.get(name)
+        if found is None or found.shape != shape:
+            what = "is missing" if found is None else f"has the shape {found.shape}, not {shape}"
+            raise CheckpointError(f"the weights do not fit their architecture: '{name}' {what}")
+        self._left.discard(name)
+        return found.astype(np.float64)
+
+    def check_all_used(self) -> None:
+        """Raises CheckpointError where a tensor was not asked for."""
+        left = sorted(name for name in self._left if not name.endswith("num_batches_tracked"))
+        if left:
+            raise CheckpointError(
+                f"the weights do not fit their architecture: {len(left)} are unknown, e.g. '{left[0]}'"
+            )
+
+    def affine(self, name: str, num_in: int, num_out: int) -> Affine:
+        """A 1x1 convolution."""
+        part = self.at(name)
+        return part.array("weight", num_out, num_in, 1)[:, :, 0], part.array("bias", num_out)[:, None]
+
+    def scale_shift(self, name: str, width: int) -> Affine:
+        """A batch norm in evaluation as x * scale + shift, each (C, 1)."""
+        part = self.at(name)
+        scale = part.array("weight", width) / np.sqrt(part.array("running_var", width) + BATCH_NORM_EPS)
+        return scale[:, None], (part.array("bias", width) - part.array("running_mean", width) * scale)[
+            :, None
+        ]
+
+    def two_layer(self, name: str, num_in: int, num_hidden: int, num_out: int) -> tuple[Affine, Affine]:
+        """Two 1x1 convolutions, the norm between them folded into the first."""
+        part = self.at(name)
+        weight, bias = part.affine("linear1", num_in, num_hidden)
+        scale, shift = part.scale_shift("norm", num_hidden)
+        return (weight * scale, bias * scale + shift), part.affine("linear2", num_hidden, num_out)
 
 
-def product(weight: Tensor, x: Tensor, bias: Tensor | None = None) -> Tensor:
-    """weight (O, C) times every x (B, C, N), plus bias (O, 1)."""
-    weight = weight.expand(len(x), -1, -1)
-    return torch.bmm(weight, x) if bias is None else torch.baddbmm(bias, weight, x)
+def single(x: FloatArray) -> Float32Array:
+    """In single precision, without gaps in memory."""
+    return np.ascontiguousarray(x, dtype=np.float32)
 
 
-def scale_relu(x: Tensor, norm: tuple[Tensor, Tensor]) -> Tensor:
-    """ReLU of a batch norm."""
-    return torch.addcmul(norm[1], x, norm[0]).relu_()
+class Product:
+    """Weight (O, C) times every x (B, C, N), plus bias (O, 1) where there is one."""
+
+    def __init__(self, weight: FloatArray, bias: FloatArray | None = None) -> None:
+        self.weight, self.bias = single(weight), None if bias is None else single(bias)
+
+    def __call__(self, x: Float32Array) -> Float32Array:
+        """(B, C, N) to (B, O, N)."""
+        y: Float32Array = np.matmul(self.weight, x)
+        if self.bias is not None:
+            y += self.bias
+        return y
 
 
-def norm_relu(x: Tensor, norm: tuple[Tensor, Tensor]) -> Tensor:
-    """ReLU of batch norm of context norm over the last axis, in place on a centred copy."""
-    centred = x - x.mean(dim=-1, keepdim=True)
-    variance = torch.linalg.vecdot(centred, centred)[..., None] / x.shape[-1]
-    scale = norm[0] * torch.rsqrt(variance + ContextNorm.eps)
-    return centred.mul_(scale).add_(norm[1]).relu_()
+class TwoProducts:
+    """Affine, ReLU, affine."""
+
+    def __init__(self, both: tuple[Affine, Affine]) -> None:
+        self.first, self.second = (Product(*one) for one in both)
+
+    def __call__(self, x: Float32Array) -> Float32Array:
+        """(B, C, N) to (B, O, N)."""
+        return self.second(relu(self.first(x)))
 
 
-class FoldedAmong:
-    """Sub-fields attend to each other."""
+class NormRelu:
+    """ReLU of a batch norm, of a context norm over the last axis where that leads."""
 
-    def __init__(self, block: GraphAttention) -> None:
-        self.heads = block.num_heads
-        width = block.query.in_channels
-        key, key_bias = affine(block.key)
-        value, value_bias = affine(block.value)
-        query, query_bias = affine(block.query)
-        scale = (width // self.heads) ** -0.5
-        self.all = torch.cat([query * scale, key, value])
-        self.all_bias = torch.cat([query_bias * scale, key_bias, torch.zeros_like(value_bias)])
-        self.update = FoldedUpdate(block, value_bias)
+    def __init__(self, norm: Affine, *, context: bool) -> None:
+        self.scale, self.shift = map(single, norm)
+        self.context = context
 
-    def __call__(self, z: Tensor) -> Tensor:
-        """Sub-fields (B, C, M) to the same shape."""
-        num, _, num_fields = z.shape
-        parts = product(self.all, z, self.all_bias).view(num, 3, self.heads, -1, num_fields)
-        q, k, v = (part.reshape(num * self.heads, -1, num_fields) for part in parts.unbind(1))
-        attention = torch.bmm(q.transpose(1, 2), k).softmax(dim=2)
-        return self.update(z, torch.bmm(v, attention.transpose(1, 2)).view(z.shape))
+    def __call__(self, x: Float32Array) -> Float32Array:
+        """(B, C, N) to the same shape."""
+        if not self.context:
+            h = x * self.scale
+        else:
+            h = x - x.mean(axis=-1, keepdims=True)
+            variance = np.einsum("bcn,bcn->bc", h, h)[..., None] / np.float32(x.shape[-1])
+            h *= self.scale / np.sqrt(variance + np.float32(CONTEXT_NORM_EPS))
+        h += self.shift
+        return relu(h)
+
+
+def relu(x: Float32Array) -> Float32Array:
+    """In place."""
+    np.maximum(x, np.float32(0), out=x)
+    return x
+
+
+def softmax(x: Float32Array, axis: int) -> Float32Array:
+    """In place."""
+    x -= x.max(axis=axis, keepdims=True)
+    np.exp(x, out=x)
+    x /= x.sum(axis=axis, keepdims=True)
+    return x
 
 
 class FoldedUpdate:
     """a + TwoLayer(concat[a, message(heads)]) with the message folded into the first layer.
 
     Args:
-        block: whose message and update these are.
+        tensors: of the attention whose message and update these are.
+        width: channels.
         value_bias: left out of the heads; attention sums to one, so it is a constant of the message.
     """
 
-    def __init__(self, block: GraphAttention, value_bias: Tensor) -> None:
-        first, first_bias, self.second, self.second_bias = two_layer(block.update)
-        message, message_bias = affine(block.message)
-        width = message.shape[0]
-        self.own = first[:, :width].contiguous()
-        self.heads = first[:, width:] @ message
-        self.bias = first_bias + first[:, width:] @ (message_bias + message @ value_bias)
+    def __init__(self, tensors: Tensors, width: int, value_bias: FloatArray) -> None:
+        (first, first_bias), second = tensors.two_layer("update", 2 * width, 2 * width, width)
+        message, message_bias = tensors.affine("message", width, width)
+        own, heads = first[:, :width], first[:, width:] @ message
+        bias = first_bias + first[:, width:] @ (message_bias + message @ value_bias)
+        self.both = TwoProducts(((np.hstack([own, heads]), bias), second))
 
-    def __call__(self, a: Tensor, heads: Tensor) -> Tensor:
+    def __call__(self, a: Float32Array, heads: Float32Array) -> Float32Array:
         """Both (B, C, M) to the updated a."""
-        hidden = product(self.own, a, self.bias).add_(product(self.heads, heads)).relu_()
-        return product(self.second, hidden, self.second_bias).add_(a)
+        change = self.both(np.concatenate([a, heads], axis=1))
+        change += a
+        return change
+
+
+class _Among:
+    """Sub-fields attend to each other."""
+
+    def __init__(self, tensors: Tensors, config: NetworkConfig) -> None:
+        width, self.heads = config.width, config.num_heads
+        parts = [tensors.affine(name, width, width) for name in ("query", "key", "value")]
+        value_bias = parts[2][1]
+        scale = (width // self.heads) ** -0.5
+        self.all = Product(
+            np.vstack([parts[0][0] * scale, parts[1][0], parts[2][0]]),
+            np.vstack([parts[0][1] * scale, parts[1][1], np.zeros_like(value_bias)]),
+        )
+        self.update = FoldedUpdate(tensors, width, value_bias)
+
+    def __call__(self, z: Float32Array) -> Float32Array:
+        num, _, num_fields = z.shape
+        parts = self.all(z).reshape(num, 3, self.heads, -1, num_fields)
+        q, k, v = parts[:, 0], parts[:, 1], parts[:, 2]
+        attention = softmax(np.matmul(q.swapaxes(2, 3), k), 3)
+        return self.update(z, np.matmul(v, attention.swapaxes(2, 3)).reshape(z.shape))
 
 
 class FoldedRectifier:
     """Both paths, their fusion and the experts."""
 
-    def __init__(self, module: BiPathRectifier) -> None:
-        self.gain: list[tuple[Tensor, Tensor]] = []
-        self.sigmoid = False
-        if module.channel is not None:
-            self.sigmoid = module.channel.channelwise
-            self.gain = _gain(module.channel)
-        self.spatial = None if module.spatial is None else FoldedAmong(module.spatial)
-        self.fuse = None if module.fuse is None else two_layer(module.fuse)
-        self.experts = FoldedExperts(module.experts)
+    def __init__(self, tensors: Tensors, config: NetworkConfig) -> None:
+        width, self.form = config.width, config.channel_path
+        self.gain = None
+        if self.form == "scalar":
+            self.gain = TwoProducts(tensors.two_layer("channel.gain", width, width, 1))
+        elif self.form == "channelwise":
+            first, second = (tensors.affine(f"channel.gain.{k}", width, width) for k in (0, 2))
+            self.gain = TwoProducts((first, second))
+        self.spatial = _Among(tensors.at("spatial"), config) if config.spatial_path else None
+        wide = width * ((self.gain is not None) + (self.spatial is not None))
+        self.fuse = TwoProducts(tensors.two_layer("fuse", wide, wide, width)) if wide else None
+        self.experts = FoldedExperts(tensors.at("experts"), config)
 
-    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor | None]:
+    def __call__(self, z: Float32Array) -> tuple[Float32Array, IntArray | None]:
         """Sub-fields (B, C, M) rectified, and the main expert (B, M) of each."""
         paths = []
-        if self.gain:
-            (a, a_bias), (b, b_bias) = self.gain
-            gain = product(b, product(a, z.mean(dim=2, keepdim=True), a_bias).relu_(), b_bias)
-            paths.append(z * (gain.sigmoid() if self.sigmoid else gain))
+        if self.gain is not None:
+            gain = self.gain(z.mean(axis=2, keepdims=True))
+            paths.append(z * (1 / (1 + np.exp(-gain)) if self.form == "channelwise" else gain))
         if self.spatial is not None:
             paths.append(self.spatial(z))
-        if self.fuse is not None:
-            a, a_bias, b, b_bias = self.fuse
-            z = product(b, product(a, torch.cat(paths, dim=1), a_bias).relu_(), b_bias)
-        return self.experts(z)
+        return self.experts(z if self.fuse is None else self.fuse(np.concatenate(paths, axis=1)))
 
 
 class FoldedExperts:
     """F-MoE, its dense stand-in or nothing, with the residual."""
 
-    def __init__(self, module: FeedForward) -> None:
-        self.residual = module.residual
-        body = module.body
-        self.moe = body if isinstance(body, FMoE) else None
-        self.dense = (*affine(body.up), *affine(body.down)) if isinstance(body, DenseFeedForward) else None
-        if self.moe is not None:
-            moe = self.moe
-            self.router = two_layer(moe.router)
-            self.num, self.width, inner = moe.up_weight.shape
-            self.up = moe.up_weight.detach().reshape(-1, inner).clone()
-            self.up_bias = moe.up_bias.detach().reshape(-1, 1).clone()
+    def __init__(self, tensors: Tensors, config: NetworkConfig) -> None:
+        self.config = config
+        width, num, inner = config.width, config.num_experts, config.expert_width
+        body = tensors.at("body")
+        if config.feed_forward == "dense":
+            wide = config.top_k * inner
+            self.dense = TwoProducts((body.affine("up", width, wide), body.affine("down", wide, width)))
+        elif config.feed_forward == "moe":
+            self.router = TwoProducts(body.two_layer("router", width, width, num))
+            up = body.array("up_weight", num, inner, width).reshape(-1, width)
+            self.up = Product(up, body.array("up_bias", num, inner).reshape(-1, 1))
             # Hidden units and, for the biases, the expert weights themselves go down in one product.
-            down = moe.down_weight.detach().transpose(0, 1).reshape(inner, -1)
-            self.down = torch.cat([down, moe.down_bias.detach().t()], dim=1).contiguous()
+            down = body.array("down_weight", num, width, inner).swapaxes(0, 1).reshape(width, -1)
+            self.down = Product(np.hstack([down, body.array("down_bias", num, width).T]))
 
-    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor | None]:
+    def __call__(self, z: Float32Array) -> tuple[Float32Array, IntArray | None]:
         """The sub-fields (B, C, M) after their experts, and the main expert (B, M) of each."""
-        if self.dense is not None:
-            a, a_bias, b, b_bias = self.dense
-            change = product(b, product(a, z, a_bias).relu_(), b_bias)
-            return (change.add_(z) if self.residual else change), None
-        if self.moe is None:
+        main = None
+        if self.config.feed_forward == "none":
             return z, None
-        a, a_bias, b, b_bias = self.router
-        logits = product(b, product(a, z, a_bias).relu_(), b_bias)
-        weights = expert_weights(logits, self.moe.top_k, self.moe.router_order)
-        hidden = product(self.up, z, self.up_bias).relu_().view(len(z), self.num, self.width, -1)
-        hidden = hidden.mul_(weights[:, :, None]).view(len(z), self.num * self.width, -1)
-        change = product(self.down, torch.cat([hidden, weights], dim=1))
-        return (change.add_(z) if self.residual else change), weights.argmax(dim=1)
+        if self.config.feed_forward == "dense":
+            change = self.dense(z)
+        else:
+            weights = _expert_weights(self.router(z), self.config.top_k, self.config.router_order)
+            num, experts, num_fields = weights.shape
+            hidden = relu(self.up(z)).reshape(num, experts, -1, num_fields)
+            hidden *= weights[:, :, None]
+            change = self.down(np.concatenate([hidden.reshape(num, -1, num_fields), weights], axis=1))
+            main = weights.argmax(axis=1)
+        if self.config.feed_forward_residual:
+            change += z
+        return change, main
 
 
-def _gain(module: ChannelPath) -> list[tuple[Tensor, Tensor]]:
-    if isinstance(module.gain, TwoLayer):
-        a, a_bias, b, b_bias = two_layer(module.gain)
-        return [(a, a_bias), (b, b_bias)]
-    return [affine(part) for part in module.gain.modules() if isinstance(part, torch.nn.Conv1d)]
+def _expert_weights(logits: Float32Array, top_k: int, order: str) -> Float32Array:
+    """Router logits (B, T, M) to the weights of the chosen experts, zero elsewhere."""
+    chosen = np.argsort(-logits, axis=1, kind="stable")[:, :top_k]
+    if order == "softmax_top_k":
+        kept = np.take_along_axis(softmax(logits, 1), chosen, axis=1)
+    else:
+        kept = softmax(np.take_along_axis(logits, chosen, axis=1), 1)
+    weights = np.zeros_like(logits)
+    np.put_along_axis(weights, chosen, kept, axis=1)
+    return weights

@@ -12,7 +12,6 @@ the paper, and where its text and released code differ `NetworkConfig` has a swi
 
 from __future__ import annotations
 
-import math
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from geomoe3d.networks.aligned import CHANNELS
+from geomoe3d.networks.aligned import CHANNELS, PRIOR_KERNEL
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.layers import GeoMoELayer, MotionInitialisation, MotionVerdict, motion
 from geomoe3d.networks.moe import Routing
@@ -135,10 +134,6 @@ class GeoMoE(nn.Module):
         if self.verdict is not None:
             verdict = self.verdict(channels, field, together, wide_mask)
         return replace(_collect(torch.stack(verdicts), routings, mask, tuple(insights)), verdict=verdict)
-
-
-PRIOR_KERNEL = math.exp(-0.5 / 0.75**2)
-"""The channel ``residual`` at a residual of one inlier threshold: the first prior is what lies below."""
 
 
 def together_under_motion(channels: Tensor | None) -> Tensor:

@@ -1,16 +1,13 @@
-"""Running a trained GeoMoE on one pair, and what its last layer did with the correspondences."""
+"""What the last layer of a trained GeoMoE did with the correspondences of one pair; numpy alone."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from geomoe3d.networks.architecture import NetworkConfig
-from geomoe3d.networks.folded import FoldedGeoMoE, FoldedOutput
-from geomoe3d.networks.inputs import PairInput
-from geomoe3d.networks.layers import weights_from_logits
+from geomoe3d.networks.folded import FoldedOutput
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, IntArray
 
 
@@ -35,19 +32,17 @@ class Insight:
 
     def fill(self, seen: IntArray, out: FoldedOutput) -> None:
         """Write what the network said of the rows ``seen``."""
-        self.logits_per_layer[:, seen] = out.logits.cpu().numpy()
-        if out.sub_field is not None:
-            sub_field = out.sub_field.cpu().numpy()
-            self.sub_field[seen] = sub_field
-            if out.expert is not None:
-                self.expert[seen] = out.expert.cpu().numpy()[sub_field]
+        self.logits_per_layer[:, seen] = out.logits
+        self.sub_field[seen] = out.sub_field
+        if out.expert is not None:
+            self.expert[seen] = out.expert[out.sub_field]
 
     def output(self, config: NetworkConfig) -> FilterOutput:
         """Weights relu(tanh(logit)), 0 where not seen; ``groups`` is the expert of each one's sub-field."""
         logits = np.nan_to_num(self.logits_per_layer[-1], nan=-np.inf)
         experts = config.num_experts if config.feed_forward == "moe" else 0
         return FilterOutput(
-            weights=weights_from_logits(torch.from_numpy(logits)).numpy(),
+            weights=np.maximum(np.tanh(logits), 0.0),
             logits=logits,
             groups=np.where(self.expert < 0, experts, self.expert) if experts else None,
             group_names=(*(f"expert {i + 1}" for i in range(experts)), "not seen") if experts else (),
@@ -58,18 +53,3 @@ def finite_part(correspondences: Correspondences) -> tuple[IntArray, Corresponde
     """The rows without NaN or infinity, and the correspondences of these rows."""
     seen = np.flatnonzero(np.isfinite(correspondences.points).all(axis=1))
     return seen, correspondences if len(seen) == len(correspondences) else correspondences.take(seen)
-
-
-def run(network: FoldedGeoMoE, inputs: PairInput, device: torch.device) -> FoldedOutput:
-    """One pass with insight."""
-    return run_several(network, [inputs], device)[0]
-
-
-def run_several(network: FoldedGeoMoE, inputs: list[PairInput], device: torch.device) -> list[FoldedOutput]:
-    """One pass with insight, one pair under several motions: inputs that differ in their channels only."""
-    given = [one.channels for one in inputs if one.channels is not None]
-    channels = torch.stack(given).to(device) if given else None
-    first = inputs[0]
-    return network.under_motions(
-        first.coordinates.to(device), channels, first.neighbors.to(device), insight=True
-    )

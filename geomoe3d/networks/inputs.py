@@ -15,15 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.errors import InputError, NonFiniteError
-from geomoe3d.networks.aligned import AlignedChannels
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.compatibility import compatibility_inputs
 from geomoe3d.networks.frames import canonical_rotations
 from geomoe3d.networks.geomoe import find_neighbors
-
-MIN_CORRESPONDENCES = 3
+from geomoe3d.networks.motion_inputs import MotionInputs, centred_voxels
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ def pair_input(
             the network was trained with and that is not given.
         NonFiniteError: a coordinate is NaN or infinite.
     """
-    points, voxels = _check(correspondences, voxel_size, config)
+    points, voxels = map(torch.from_numpy, centred_voxels(np.asarray(correspondences), voxel_size, config))
     turned = None
     if config.frame != "given":
         A, B = turned = canonical_rotations(points, voxel_size, config.frame)
@@ -123,38 +120,12 @@ def pair_input(
     return PairInput(coordinates, torch.cat(channels, dim=1) if channels else None, neighbors, turned)
 
 
-class MotionInputs:
-    """Prepares one pair for a network that judges motions; build once per pair, then ask for any motions.
-
-    Args:
-        correspondences: (N, 6) float, N >= 3, any unit.
-        viewpoints: (3,) where the two sensors stood, same coordinates, or None for both.
-        voxel_size: in the same unit.
-        config: of a network with the channels ``aligned``.
-        surfaces: of the correspondences in units of its compatibility threshold, where somebody has them.
-
-    Raises:
-        InputError, NonFiniteError: as `pair_input`.
-    """
-
-    def __init__(
-        self,
-        correspondences: NDArray[Any] | Tensor,
-        viewpoints: tuple[NDArray[Any] | None, NDArray[Any] | None],
-        voxel_size: float,
-        config: NetworkConfig,
-        surfaces: KeypointSurfaces | None = None,
-    ) -> None:
-        points, voxels = _check(correspondences, voxel_size, config)
-        self._coordinates = voxels / config.unit_voxels
-        threshold = config.compatibility_threshold * voxel_size
-        self._neighbors = find_neighbors(self._coordinates[None], config)[0]
-        self._aligned = AlignedChannels(points.numpy(), viewpoints, threshold, surfaces)
-
-    def under(self, motions: NDArray[Any]) -> list[PairInput]:
-        """One input for each motion p_target = R p_source + t, (K, 4, 4), in the correspondences' frames."""
-        channels = torch.from_numpy(self._aligned(motions[:, :3, :3], motions[:, :3, 3]))
-        return [PairInput(self._coordinates, of_one, self._neighbors) for of_one in channels]
+def under_motions(inputs: MotionInputs, motions: NDArray[Any]) -> list[PairInput]:
+    """One input for each motion (K, 4, 4), for a network that judges them."""
+    coordinates, neighbors = torch.from_numpy(inputs.coordinates), torch.from_numpy(inputs.neighbors)
+    return [
+        PairInput(coordinates, channels, neighbors) for channels in torch.from_numpy(inputs.channels(motions))
+    ]
 
 
 def collate(pairs: list[PairInput]) -> BatchInput:
@@ -173,25 +144,6 @@ def collate(pairs: list[PairInput]) -> BatchInput:
     if min(lengths) < longest:
         mask = torch.arange(longest)[None] < torch.tensor(lengths)[:, None]
     return BatchInput(coordinates, channels, neighbors, mask)
-
-
-def _check(
-    correspondences: NDArray[Any] | Tensor, voxel_size: float, config: NetworkConfig
-) -> tuple[Tensor, Tensor]:
-    """The points (N, 2d) in double precision, and centred in voxels, float32."""
-    points = torch.as_tensor(correspondences).double()
-    if points.ndim != 2 or points.shape[1] != config.correspondence_dim:
-        raise InputError(
-            f"correspondences must be (N, {config.correspondence_dim}) for this network, "
-            f"found {tuple(points.shape)}"
-        )
-    if len(points) < MIN_CORRESPONDENCES:
-        raise InputError(f"{len(points)} correspondences; the network needs at least {MIN_CORRESPONDENCES}")
-    if not (np.isfinite(voxel_size) and voxel_size > 0):
-        raise InputError(f"voxel_size must be positive, found {voxel_size}")
-    if not bool(torch.isfinite(points).all()):
-        raise NonFiniteError("correspondences hold NaN or infinite coordinates; drop those rows first")
-    return points, ((points - points.mean(dim=0)) / voxel_size).float()
 
 
 def _column(name: str, values: NDArray[Any] | Tensor | None, like: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.architecture import LEAST_MEAN, VERDICT_WIDTH, NetworkConfig
 from geomoe3d.networks.blocks import GraphAttention, PointCN, SubFieldPool, TwoLayer
 from geomoe3d.networks.moe import DenseFeedForward, FMoE, Routing
 from geomoe3d.networks.norms import BatchNorm, Pointwise, norm_relu_linear
@@ -236,15 +236,12 @@ class MotionVerdict(nn.Module):
     attention.
     """
 
-    _HIDDEN_WIDTH = 64
-    _LEAST_MEAN = 0.005  # means are shares of the correspondences; below this they say nothing
-
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.attend = Pointwise(config.width, 1)
         self.norm = BatchNorm(3 * config.input_width + 1 + 2 * config.width)
-        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, self._HIDDEN_WIDTH)
-        self.out = Pointwise(self._HIDDEN_WIDTH, 1)
+        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, VERDICT_WIDTH)
+        self.out = Pointwise(VERDICT_WIDTH, 1)
 
     def forward(self, channels: Tensor, field: Tensor, together: Tensor, mask: Tensor | None) -> Tensor:
         """Verdicts of a batch.
@@ -272,7 +269,7 @@ class MotionVerdict(nn.Module):
         pooled = torch.cat(
             [
                 means,
-                (means.clamp(min=0) + self._LEAST_MEAN).log(),
+                (means.clamp(min=0) + LEAST_MEAN).log(),
                 kept,
                 (total + 0.1).log(),
                 (field * real).sum(2) / count,

@@ -10,17 +10,13 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.errors import CheckpointError
-from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.folded import FoldedGeoMoE, FoldedOutput
-from geomoe3d.networks.geomoe import GeoMoE
-from geomoe3d.networks.inference import Insight, finite_part, run_several
-from geomoe3d.networks.inputs import MIN_CORRESPONDENCES, MotionInputs
-from geomoe3d.networks.one_thread import helper_keeps_to_one_torch_thread, single_torch_thread
-from geomoe3d.networks.pretrained import WeightCard, load_pretrained
+from geomoe3d.networks.inference import Insight, finite_part
+from geomoe3d.networks.motion_inputs import MIN_CORRESPONDENCES, MotionInputs
+from geomoe3d.networks.weight_files import WeightCard, read_weights
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, IntArray
 
@@ -49,38 +45,33 @@ class MotionJudge:
     """A network that judges motions.
 
     Args:
-        model: trained with the channels ``aligned``; its weights are copied.
+        network: trained with the channels ``aligned``.
         card: what it is, or None.
-        device: where it runs.
 
     Raises:
         CheckpointError: a network that judges no motions.
     """
 
-    def __init__(
-        self, model: GeoMoE, card: WeightCard | None = None, device: str | torch.device = "cpu"
-    ) -> None:
-        if not model.config.judges_motions:
+    def __init__(self, network: FoldedGeoMoE, card: WeightCard | None = None) -> None:
+        if not network.config.judges_motions:
             raise CheckpointError(
                 "this network judges no transforms, it is an outlier filter: give its weights as filter.weights"
             )
-        self.config = model.config
+        self.config = network.config
         self.card = card
-        self.device = torch.device(device)
-        self._network = FoldedGeoMoE(model.to(self.device).eval())
+        self._network = network
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | Path, device: str | torch.device = "cpu") -> MotionJudge:
+    def from_pretrained(cls, name_or_path: str | Path) -> MotionJudge:
         """Load a .safetensors file with its card, or weights that ship with the package.
 
         Raises:
-            CheckpointError: see `geomoe3d.networks.pretrained.load_pretrained`.
+            CheckpointError: see `geomoe3d.networks.weight_files.read_weights` and `FoldedGeoMoE`.
         """
-        model, card = load_pretrained(name_or_path)
-        return cls(model, card, device)
+        config, tensors, card = read_weights(name_or_path)
+        return cls(FoldedGeoMoE(config, tensors), card)
 
     @single_blas_thread()
-    @single_torch_thread()
     def about(
         self,
         correspondences: Correspondences,
@@ -100,26 +91,18 @@ class MotionJudge:
         if len(seen) >= MIN_CORRESPONDENCES:
             views = part.viewpoints or (None, None)
             inputs = MotionInputs(part.points, views, voxel_size, self.config, surfaces)
-        return PairJudge(self._network, self.config, self.device, inputs, seen, len(correspondences))
+        return PairJudge(self._network, inputs, seen, len(correspondences))
 
 
 class PairJudge:
     """What the network says of motions of one pair's correspondences; see `MotionJudge.about`."""
 
     def __init__(
-        self,
-        network: FoldedGeoMoE,
-        config: NetworkConfig,
-        device: torch.device,
-        inputs: MotionInputs | None,
-        seen: IntArray,
-        num_rows: int,
+        self, network: FoldedGeoMoE, inputs: MotionInputs | None, seen: IntArray, num_rows: int
     ) -> None:
-        self._network, self._config, self._device = network, config, device
-        self._inputs, self._seen, self._num_rows = inputs, seen, num_rows
+        self._network, self._inputs, self._seen, self._num_rows = network, inputs, seen, num_rows
 
     @single_blas_thread()
-    @single_torch_thread()
     def __call__(self, motions: FloatArray) -> list[Judged]:
         """Judge motions, several at a time where there are threads.
 
@@ -135,16 +118,13 @@ class PairJudge:
         return [judged for part in each(self._judge, parts) for judged in part]
 
     def _judge(self, motions: FloatArray) -> list[Judged]:
-        helper_keeps_to_one_torch_thread()
-        assert self._inputs is not None
-        outputs = run_several(self._network, self._inputs.under(motions), self._device)
-        return [
-            Judged(float(out.verdict), partial(self._output, out))
-            for out in outputs
-            if out.verdict is not None
-        ]
+        inputs = self._inputs
+        assert inputs is not None
+        outputs = self._network.under_motions(inputs.coordinates, inputs.channels(motions), inputs.neighbors)
+        return [Judged(out.verdict, partial(self._output, out)) for out in outputs if out.verdict is not None]
 
     def _output(self, out: FoldedOutput) -> FilterOutput:
-        insight = Insight.blind(self._num_rows, self._config.num_layers)
+        config = self._network.config
+        insight = Insight.blind(self._num_rows, config.num_layers)
         insight.fill(self._seen, out)
-        return insight.output(self._config)
+        return insight.output(config)

@@ -15,6 +15,8 @@ import torch.nn.functional as F  # noqa: N812 - the field's name for it
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from geomoe3d.networks.architecture import CONTEXT_NORM_EPS
+
 _recomputing = threading.local()
 
 
@@ -104,7 +106,7 @@ def norm_relu_linear(x: Tensor, norm: BatchNorm, linear: Pointwise, mask: Tensor
 class ContextNorm(nn.Module):
     """Each pair's channels to zero mean and unit (biased) variance over its own correspondences."""
 
-    eps = 1e-3
+    eps = CONTEXT_NORM_EPS
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, C, N) to the same shape."""

@@ -14,8 +14,9 @@ from geomoe3d.errors import CheckpointError
 from geomoe3d.networks.build import Network
 from geomoe3d.networks.frames import THRESHOLD_VOXELS
 from geomoe3d.networks.inference import finite_part
-from geomoe3d.networks.inputs import MIN_CORRESPONDENCES, pair_input
+from geomoe3d.networks.inputs import pair_input
 from geomoe3d.networks.layers import weights_from_logits
+from geomoe3d.networks.motion_inputs import MIN_CORRESPONDENCES
 from geomoe3d.networks.seeded_motions import motion_residuals, seeded_motion, spread_seeds
 from geomoe3d.types import Correspondences, FilterOutput
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import PartConfig
-from geomoe3d.errors import CheckpointError, DependencyError
+from geomoe3d.errors import CheckpointError
 from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, check_weights, file_hash, judges_transforms
 from geomoe3d.runtime.sources import source_hash
 from geomoe3d.scoring.base import PairScorer, Scorer, scorer
@@ -95,13 +95,8 @@ class NetworkScorer(Scorer):
 
     @cached_property
     def _judge(self) -> MotionJudge:
-        try:
-            from geomoe3d.networks.motion_judge import MotionJudge
-        except ImportError as error:
-            raise DependencyError(
-                f"the scorer 'network' needs PyTorch ({error}); `geomoe3d doctor` gives the command that installs "
-                "it, or leave it out: scoring.scorers=[surfaces]"
-            ) from error
+        from geomoe3d.networks.motion_judge import MotionJudge
+
         return MotionJudge.from_pretrained(self._path)
 
     def warm_up(self) -> None:
@@ -109,7 +104,6 @@ class NetworkScorer(Scorer):
 
         Raises:
             CheckpointError: the weights do not fit.
-            DependencyError: PyTorch is not installed.
         """
         self._judge  # noqa: B018
 

@@ -23,7 +23,8 @@ from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import rotation_error_deg
 from geomoe3d.networks.architecture import NetworkConfig
-from geomoe3d.networks.inputs import BatchInput, MotionInputs, PairInput, collate, pair_input
+from geomoe3d.networks.inputs import BatchInput, PairInput, collate, pair_input, under_motions
+from geomoe3d.networks.motion_inputs import MotionInputs
 from geomoe3d.runtime.threads import THREADS_VARIABLE
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
@@ -131,7 +132,7 @@ def make_sample(
         views: tuple[Any, Any] = (None, None)
         if pair.viewpoints is not None and not (rng is not None and rng.random() < data.hidden_viewpoints):
             views = (pair.viewpoints[0], pair.viewpoints[1])
-        several = MotionInputs(points, views, pair.voxel_size, network).under(motions)
+        several = under_motions(MotionInputs(points.numpy(), views, pair.voxel_size, network), motions)
         return Sample(tuple(several), labels, truth, torch.from_numpy(right))
     inputs = pair_input(
         points,

@@ -21,7 +21,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
 from geomoe3d.networks.build import Network, build_network
-from geomoe3d.networks.pretrained import WeightCard, load_network, save_pretrained
+from geomoe3d.networks.pretrained import load_network, save_pretrained
+from geomoe3d.networks.weight_files import WeightCard
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples

@@ -13,6 +13,7 @@ from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.columns import extents, largest_of_rows
+from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.threads import each, usable_threads
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
@@ -251,7 +252,7 @@ def drop_isolated(points: FloatArray, radius: float) -> FloatArray:
 
 def estimate_normals(points: FloatArray, radius: float, neighbors: int) -> FloatArray:
     """Unit normals (n, 3) of local planes, sign arbitrary, by Open3D."""
-    import open3d as o3d
+    o3d = open3d_core()
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, neighbors))

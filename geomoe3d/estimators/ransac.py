@@ -12,6 +12,7 @@ from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.types import FloatArray, Hypothesis
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class RansacEstimator(Estimator):
             spread(rows[:, :3], np.ones(len(rows))), spread(rows[:, 3:], np.ones(len(rows)))
         ) < (1e-6 * inlier_threshold):
             return []
-        import open3d as o3d
+        o3d = open3d_core()
 
         registration = o3d.pipelines.registration
         o3d.utility.random.seed(seed)

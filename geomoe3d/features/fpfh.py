@@ -12,6 +12,7 @@ import numpy as np
 
 from geomoe3d.config import DescriptorConfig
 from geomoe3d.features.base import Descriptor, descriptor
+from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.types import Float32Array, PreparedCloud
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class FpfhDescriptor(Descriptor):
 
     def __call__(self, cloud: PreparedCloud) -> Float32Array:
         """See `Descriptor`."""
-        import open3d as o3d
+        o3d = open3d_core()
 
         # The tensor API gives the legacy one's features in two thirds of its time. It works in single precision,
         # hence centred and in voxels.

@@ -11,6 +11,7 @@ dearest imports.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import statistics
@@ -108,7 +109,7 @@ def stages(clouds: list[Path]) -> None:
     registrar = geomoe3d.Registrar()
     registrar.register(clouds[0], clouds[1])
     found: dict[str, list[float]] = {}
-    for one, other in zip(clouds[:-1], clouds[1:], strict=True):
+    for one, other in itertools.pairwise(clouds):
         for stage, seconds in registrar.register(other, one).seconds.items():
             found.setdefault(stage, []).append(seconds)
     print(f"\nstages, medians of {len(clouds) - 1} pairs in one warm process, ms:")

@@ -27,9 +27,8 @@ def open3d_core() -> Any:
         ImportError: Open3D is not installed.
     """
     with _lock:
-        if "open3d" not in sys.modules:
-            if _NAME in sys.modules or _load():
-                return sys.modules[_NAME]
+        if "open3d" not in sys.modules and (_NAME in sys.modules or _load()):
+            return sys.modules[_NAME]
         import open3d
 
         return open3d
@@ -38,7 +37,9 @@ def open3d_core() -> Any:
 def _load() -> bool:
     """Load the compiled half; False where it is to be had in the usual way alone."""
     spec = importlib.util.find_spec("open3d")
-    if spec is None or spec.origin is None or sys.platform == "win32":  # there Open3D says where libraries lie
+    if (
+        spec is None or spec.origin is None or sys.platform == "win32"
+    ):  # there Open3D says where libraries lie
         return False
     places = [Path(spec.origin).with_name(f"pybind{suffix}") for suffix in EXTENSION_SUFFIXES]
     found = next((place for place in places if place.is_file()), None)

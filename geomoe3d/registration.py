@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -15,7 +16,13 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size, scale_mismatch
+from geomoe3d.clouds.prepare import (
+    bounded_voxel_size,
+    check_cloud,
+    choose_voxel_size,
+    robust_extent,
+    scale_mismatch,
+)
 from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, between_clouds
@@ -23,6 +30,7 @@ from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.remarks import remarks
+from geomoe3d.decision.scale import likely_unit_ratio, measure_scale, seeming_units
 from geomoe3d.decision.selection import Selection
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.features.cache import FeatureCache
@@ -152,7 +160,8 @@ class Registrar:
             check_cloud(cloud)
         mismatch = scale_mismatch(*clouds)
         if mismatch is not None:
-            failed = failed_result(clouds, mismatch, config, clock.stop())
+            reason = self._units(clouds, clock) or mismatch
+            failed = failed_result(clouds, reason, config, clock.stop())
             return Explanation(failed, *clouds).remembering(source, target)
         clock("prepare")
         wanted = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
@@ -170,6 +179,11 @@ class Registrar:
             other = self._look(prepared, None, clock, initial, given, rivals=decision)
             if other[2].judgement.confidence > decision.judgement.confidence:
                 pair, weighed, decision = other
+        clock("decide")
+        if decision.answer is not None:
+            decision = decision.with_scale(measure_scale(decision.T_target_source, *pair.clouds))
+        if decision.judgement.status != "ok" and (said := self._units(clouds, clock)) is not None:
+            decision = decision.with_note(said, first=True)
         read = (source, target), pair.clouds, wanted, places is not None
         told_of = remarks(*read, config.preparation, decision.judgement)
         for remark in (*clouds[0].notes, *clouds[1].notes, *told_of):
@@ -222,6 +236,24 @@ class Registrar:
                         selection.add(line.propose(further, clock)[1])
                 decision = selection.decide(look.num_refined, look.num_judged)
         return pair, weighed, decision
+
+    def _units(self, clouds: tuple[PointCloud, PointCloud], clock: StageClock) -> str | None:
+        """A sentence where the clouds fit once the source is brought to the unit that the extents suggest.
+
+        One more registration, of pairs alone that are not ok and whose extents differ by about such a ratio.
+        """
+        source, target = clouds
+        ratio = likely_unit_ratio((robust_extent(source.points), robust_extent(target.points)))
+        if ratio is None or not self.pipeline.scorers:
+            return None
+        clock("units")
+        smaller = replace(source, points=source.points / ratio, origin=source.origin / ratio)
+        if not self.register(smaller, target).ok:
+            return None
+        return (
+            f"units differ: with all lengths of '{source.name}' divided by {ratio:.6g} the clouds fit"
+            f"{seeming_units(ratio)}; bring both to one unit, a rigid motion cannot change scale"
+        )
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""

@@ -78,8 +78,9 @@ class RegistrationResult:
         overlap: share of source voxel points (1,500 of them at most) with a target point within the inlier
             threshold.
         evidence: what the clouds say of the answer, see `geomoe3d.scoring.surfaces.Evidence`, and
-            ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; empty where
-            nothing was estimated.
+            ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; ``scale_ratio``
+            and ``scale_sigma``, see `geomoe3d.decision.scale.Scale`, where enough surface is shared; empty
+            where nothing was estimated.
         num_correspondences: correspondences given to the estimator.
         num_inliers: of these, how many agree with the transform.
         inlier_threshold: residual limit of an inlier, cloud units.

@@ -11,12 +11,14 @@ import numpy as np
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.confidence import Information, Judgement
+from geomoe3d.decision.scale import Scale
 from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames
-from geomoe3d.result import Alternative, CloudReport, RegistrationResult
+from geomoe3d.result import Alternative, CloudReport, RegistrationResult, Status
 from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
+_BELIEVED, _WRONG_SCALE_CONFIDENCE = 0.3, 0.5
 _DECIDING_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "open3d", "small_gicp", "trimesh", "torch")
 
 
@@ -30,6 +32,7 @@ class Decision:
         lead: score of the answer over that of the alternative, see `lead_over`.
         information, judgement: see their classes.
         hypotheses: all that were considered, best first, before refinement.
+        scale: how large the source is beside the target under the answer, where that was measured.
     """
 
     answer: Hypothesis | None
@@ -38,6 +41,7 @@ class Decision:
     information: Information
     judgement: Judgement
     hypotheses: tuple[Hypothesis, ...] = ()
+    scale: Scale | None = None
 
     @classmethod
     def failed(cls, reason: str) -> Decision:
@@ -60,9 +64,24 @@ class Decision:
         both = (h for h in (self.answer, self.alternative) if h is not None)
         return [Hypothesis(h.T_target_source, h.proposal_score, h.num_inliers) for h in both]
 
-    def with_note(self, note: str) -> Decision:
-        """The same decision with one more sentence among the reasons."""
-        return replace(self, judgement=replace(self.judgement, reasons=(*self.judgement.reasons, note)))
+    def with_note(self, note: str, *, first: bool = False) -> Decision:
+        """The same decision with one more sentence among the reasons, at their end or before them."""
+        reasons = self.judgement.reasons
+        told = (note, *reasons) if first else (*reasons, note)
+        return replace(self, judgement=replace(self.judgement, reasons=told))
+
+    def with_scale(self, scale: Scale | None) -> Decision:
+        """The same decision with the scale measured: never ok where it differs, and then that is said first.
+
+        Of an answer that is hardly believed nothing is said: its surfaces are not those of one body.
+        """
+        was = self.judgement
+        if scale is None or not scale.differs or was.confidence < _BELIEVED:
+            return replace(self, scale=scale)
+        status: Status = "low_confidence" if was.status == "ok" else was.status
+        confidence = min(was.confidence, _WRONG_SCALE_CONFIDENCE)
+        judgement = Judgement(status, (scale.sentence(), *was.reasons), confidence)
+        return replace(self, scale=scale, judgement=judgement)
 
     def residuals(self, matched: Correspondences) -> FloatArray:
         """|R p + t - q| of every correspondence (N,); infinite without a transform."""
@@ -162,7 +181,7 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
 
 def _evidence(decision: Decision) -> dict[str, float]:
     """Numbers of the answer by name; without a network there is no verdict."""
-    evidence, opinion = decision.evidence, opinion_of(decision.answer)
+    evidence, opinion, scale = decision.evidence, opinion_of(decision.answer), decision.scale
     if evidence is None or decision.answer is None:
         return {}
     return {
@@ -172,6 +191,7 @@ def _evidence(decision: Decision) -> dict[str, float]:
         "score": decision.answer.score,
         "observability": decision.information.observability,
         "looseness": decision.information.looseness,
+        **({} if scale is None else {"scale_ratio": scale.ratio, "scale_sigma": scale.sigma}),
     }
 
 

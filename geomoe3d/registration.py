@@ -182,8 +182,8 @@ class Registrar:
         clock("decide")
         if decision.answer is not None:
             decision = decision.with_scale(measure_scale(decision.T_target_source, *pair.clouds))
-        if decision.judgement.status != "ok" and (said := self._units(clouds, clock)) is not None:
-            decision = decision.with_note(said, first=True)
+        if decision.judgement.status != "ok" and (units := self._units(clouds, clock)) is not None:
+            decision = decision.with_note(units, first=True)
         read = (source, target), pair.clouds, wanted, places is not None
         told_of = remarks(*read, config.preparation, decision.judgement)
         for remark in (*clouds[0].notes, *clouds[1].notes, *told_of):

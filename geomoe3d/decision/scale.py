@@ -26,8 +26,9 @@ _RANGE = (0.3, 3.0)
 # The error of the scale over the distortion, and of the fit over what independent points would leave: from
 # generated rooms; docs/measurements.md holds what came of it on real fragments.
 _PER_DISTORTION, _PER_FORMAL = 0.8, 4.5
-# No right answer on real fragments was off by more than 5 per cent: beyond 6 per cent half as many deviations do.
-_SIGNIFICANT, _TOLERATED, _UNHEARD_OF = 2.6, 0.01, 0.06
+# Firmly measured, right answers on real fragments are hardly off by more than 5 per cent: beyond 6 per cent half
+# as many deviations do.
+_SIGNIFICANT, _TOLERATED, _UNHEARD_OF, _FIRM = 2.6, 0.01, 0.06, 0.05
 
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "metres": 1.0}
 _UNIT_TOLERANCE = 0.02
@@ -48,10 +49,10 @@ class Scale:
 
     @property
     def differs(self) -> bool:
-        """Whether the ratio is off 1 by more than one per cent and more than 2.6 deviations, or, beyond six per cent,
-        more than 1.3."""
+        """Whether the ratio is off 1 by more than one per cent and more than 2.6 deviations, or, beyond six per cent
+        and where the deviation is under five, more than 1.3."""
         off = abs(float(np.log(self.ratio)))
-        enough = _SIGNIFICANT if off < _UNHEARD_OF else _SIGNIFICANT / 2
+        enough = _SIGNIFICANT / 2 if off > _UNHEARD_OF and self.sigma < _FIRM else _SIGNIFICANT
         return off > max(enough * self.sigma, _TOLERATED)
 
     def sentence(self) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 import pickle
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from small_scans import SETTINGS, UTM, cut, scene
 
 import geomoe3d
@@ -307,3 +310,27 @@ def test_long_work_shows_progress_unless_told_not_to(capsys, monkeypatch):
     count_to_three(progress=lambda done, total: told.append((done, total)))
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert capsys.readouterr() == ("", "")
+
+
+# ---- the example for robots ----------------------------------------------------------------------------
+
+
+def load_example(name):
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / "examples" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_node_for_robots_believes_sure_answers_only(result, files):
+    module = load_example("ros2_node")
+    pose, found = module.Localiser(files[1], least_confidence=0.0, config=CONFIG).locate(np.load(files[0]))
+    assert found.T_target_source.tobytes() == result.T_target_source.tobytes()
+    assert (pose is not None) == found.ok
+    if found.ok:
+        np.testing.assert_allclose(pose[0], result.T_target_source[:3, 3])
+        turned = Rotation.from_quat(pose[1]).as_matrix()
+        np.testing.assert_allclose(turned, result.T_target_source[:3, :3], atol=1e-9)
+    assert (
+        module.Localiser(files[1], least_confidence=1.01, config=CONFIG).locate(np.load(files[0]))[0] is None
+    )

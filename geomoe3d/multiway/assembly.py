@@ -20,7 +20,7 @@ from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
 from geomoe3d.multiway.grouping import Group, Growth, Poses, largest_first, reconsidered
 from geomoe3d.multiway.settling import settle
-from geomoe3d.multiway.survey import Survey, key_of
+from geomoe3d.multiway.survey import PairKey, Survey, key_of
 from geomoe3d.types import FloatArray
 
 _MOST_TURNS = 3
@@ -71,15 +71,15 @@ class Assembly:
         said twice is no second witness.
         """
         survey = self._survey
-        best, further = dict(survey.edges), list[Edge]()
+        known: dict[PairKey, list[Edge]] = {key: [survey.edges[key]] for key in sorted(survey.edges)}
         for edge in [*survey.map_edges.values(), *survey.odometry()]:
-            pair = key_of(edge.source, edge.target)
-            one = best.get(pair)
-            if one is None or not self._alike(one, edge):
-                further.append(edge)
-            elif edge.confidence > one.confidence:
-                best[pair] = edge
-        edges = [*(best[key] for key in sorted(best)), *further]
+            rivals = known.setdefault(key_of(edge.source, edge.target), [])
+            same = next((k for k, one in enumerate(rivals) if self._alike(one, edge)), None)
+            if same is None:
+                rivals.append(edge)
+            elif edge.confidence > rivals[same].confidence:
+                rivals[same] = edge
+        edges = [edge for rivals in known.values() for edge in rivals]
         if survey.sequence:
             edges = [replace(e, expected=_IN_SEQUENCE) if abs(e.source - e.target) == 1 else e for e in edges]
         return with_cycles(edges, survey.shapes, survey.rules.tolerance, survey.rules.turn_deg)

@@ -21,6 +21,7 @@ from geomoe3d.types import BoolArray, FloatArray
 _MOST_MOTIONS = 3  # of two groups that are weighed against each other
 _MOST_PROPOSALS = 60  # edges between two groups whose motions are looked at, the surest
 _MOST_WORTH = 8.0
+_ASKED = 12  # scans of each group that are asked about a motion, the nearest to its edges
 _RIVAL = 0.25  # of the worth of the best: a motion that the scans are asked about again
 
 Poses = dict[int, FloatArray]
@@ -178,10 +179,20 @@ class Growth:
         """Take off every motion what the scans contradict."""
         for way in self._ways[a, b]:
             if self._witness is not None and not way.weighed:
-                way.T_a_b, told = self._witness(self.groups[a].poses, self.groups[b].poses, way.T_a_b)
+                one, other = (self._around(self.groups[k].poses, way.supporters) for k in (a, b))
+                way.T_a_b, told = self._witness(one, other, way.T_a_b)
                 way.worth += told
             way.weighed = True
         self._ways[a, b] = self._merged(self._ways[a, b], b)
+
+    def _around(self, poses: Poses, supporters: Sequence[Edge]) -> Poses:
+        """The scans of a group nearest to where some edges end in it: far away, poses have drifted."""
+        if len(poses) <= _ASKED:
+            return poses
+        centers = {k: T[:3, :3] @ self._shapes[k].center + T[:3, 3] for k, T in poses.items()}
+        ends = np.array([centers[k] for e in supporters for k in (e.source, e.target) if k in poses])
+        away = {k: float(np.linalg.norm(ends - c, axis=1).min()) for k, c in centers.items()}
+        return {k: poses[k] for k in sorted(poses, key=lambda k: (away[k], k))[:_ASKED]}
 
     def _merged(self, ways: list[Motion], b: int) -> list[Motion]:
         """The ways, the best first, those that the surfaces drew together as one."""

@@ -24,8 +24,9 @@ from geomoe3d.types import FloatArray
 
 MAPS_FOLDER = "maps"
 _SCANS = 4  # of a map; of eight, what is not shared drowns what is
+_LIKELY = 3  # of two groups, about the surest edges between them
 _PER_TWO_GROUPS = 6
-_MOST = 24  # pairs of maps in one round
+_MOST = 32  # pairs of maps in one round
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class MapPair:
     """Two maps of two groups that may show the same place.
 
     Attributes:
-        source, target: numbers of their anchors, the larger first.
+        source, target: numbers of their anchors.
         members: the scans of both maps, the anchor first.
     """
 
@@ -50,7 +51,12 @@ def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]
 
 
 def map_pairs(
-    groups: Sequence[Group], edges: Sequence[Edge], similarity: FloatArray, overlaps: Overlaps
+    groups: Sequence[Group],
+    edges: Sequence[Edge],
+    similarity: FloatArray,
+    overlaps: Overlaps,
+    *,
+    sequence: bool = False,
 ) -> list[MapPair]:
     """Pairs of maps of different groups: about the surest edges between them, and where scans look alike.
 
@@ -59,6 +65,7 @@ def map_pairs(
         edges: of all registered pairs, with what cycles say of them.
         similarity: (K, K) of the scans.
         overlaps: of all scans.
+        sequence: whether scans with neighbouring numbers were taken one after the other.
     """
     found: list[MapPair] = []
     known: dict[int, tuple[int, ...]] = {}
@@ -73,8 +80,9 @@ def map_pairs(
             ((i, j) for i in a.poses for j in b.poses if np.isfinite(similarity[i, j])),
             key=lambda pair: (-similarity[pair], pair),
         )
-        likely = [(max(e.source, e.target), min(e.source, e.target)) for e in crossing]
-        lots = (likely, _PER_TWO_GROUPS // 2), ([(max(p), min(p)) for p in alike], _PER_TWO_GROUPS)
+        following = [(i, i + 1) for i in poses if i + 1 in poses and (i in a.poses) != (i + 1 in a.poses)]
+        likely = [(e.source, e.target) for e in crossing]
+        lots = (following if sequence else [], _PER_TWO_GROUPS), (likely, _LIKELY), (alike, _PER_TWO_GROUPS)
         chosen: list[MapPair] = []
         for lot, limit in lots:
             for source, target in lot:
@@ -86,7 +94,9 @@ def map_pairs(
                     if scan not in known:
                         known[scan] = members_of(scan, a.poses if scan in a.poses else b.poses, overlaps)
                 chosen.append(MapPair(source, target, (known[source], known[target])))
-        found += [pair for pair in chosen if max(map(len, pair.members)) > 1]
+        chosen = [pair for pair in chosen if max(map(len, pair.members)) > 1]
+        for pair in chosen:  # both ways: on so little a second try often finds what the first did not
+            found += [pair, MapPair(pair.target, pair.source, pair.members[::-1])]
     return found[:_MOST]
 
 

@@ -157,7 +157,7 @@ def register_scans(
         survey.register_maps(maps, groups)
         clock("group scans")
         known, groups = groups, assembly.groups()
-        if len(groups) == len(known):
+        if [group.poses.keys() for group in groups] == [group.poses.keys() for group in known]:
             break
     clock("write the model")
     model = describe_model(survey, assembly.edges, folder, groups)

@@ -220,7 +220,7 @@ class Survey:
             edges: all so far, with what cycles say of them.
         """
         usable = [group for group in groups if set(group.poses) <= self.surfaces.keys()]
-        return map_pairs(usable, edges, self.similarity, self.overlaps)
+        return map_pairs(usable, edges, self.similarity, self.overlaps, sequence=self.sequence)
 
     def _known(self) -> set[PairKey]:
         """Pairs in the journal whose scans and files are the same today."""

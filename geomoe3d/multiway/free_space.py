@@ -16,8 +16,8 @@ from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import FloatArray
 
 _SAMPLE = 300
-_USUAL = 0.02
-_AGAINST = 5.0  # per share of a scan that another saw through beyond that
+_USUAL = 0.01
+_AGAINST = 10.0  # per share of a scan that another saw through beyond that
 _MOST_FOR = 2.0
 _HALF_SEEN = 5.0  # of a scan's points, over all pairs, for half of what can be said for a motion
 _MARGIN = 3.0  # voxels in front of what a sensor saw: scans are bent, poses not exact
@@ -79,7 +79,7 @@ class FreeSpace:
 def told_by(seen: float, through: float) -> float:
     """Log-odds that a motion between two groups is right, by what `FreeSpace.between` gives.
 
-    A fiftieth of what is seen may be seen through: scans are bent and poses not exact.
+    A hundredth of what is seen may be seen through: scans are bent and poses not exact.
     """
     excess = through - _USUAL * seen
     if excess > 0:

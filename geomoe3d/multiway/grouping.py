@@ -21,7 +21,7 @@ from geomoe3d.types import BoolArray, FloatArray
 _MOST_MOTIONS = 3  # of two groups that are weighed against each other
 _MOST_PROPOSALS = 60  # edges between two groups whose motions are looked at, the surest
 _MOST_WORTH = 8.0
-_ASKED = 12  # scans of each group that are asked about a motion, the nearest to its edges
+_ASKED = 60  # scans of each group that are asked about a motion, the nearest to its edges: bounds the time
 _RIVAL = 0.25  # of the worth of the best: a motion that the scans are asked about again
 
 Poses = dict[int, FloatArray]

@@ -107,7 +107,8 @@ def test_going_on_with_other_settings_or_data_is_refused(tmp_path: Path) -> None
 def test_one_skipped_step_spoils_neither_the_log_nor_the_display(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from geomoe3d.cli import progress, train_display
+    from geomoe3d.cli import train_display
+    from geomoe3d.runtime import progress
 
     monkeypatch.setattr(progress, "_LOG_SECONDS", 0.0)
     step = Updater.step

@@ -229,6 +229,45 @@ def test_a_surface_that_slides_is_ambiguous_whatever_the_evidence() -> None:
         assert any("slide" in reason for reason in judged.reasons)
 
 
+def test_where_sensor_lies_on_sensor_the_surface_must_hold_more() -> None:
+    for apart, held, status in (
+        (0.5, 0.02, "ambiguous"),
+        (0.5, 0.04, "ok"),
+        (5.0, 0.02, "ok"),
+        (np.inf, 0.02, "ok"),
+    ):
+        information = replace(FIRM, sensors_apart=apart, observability=held)
+        judged = judge(evidence(4.0), 30.0, 0.2, information, DecisionConfig())
+        assert judged.status == status
+        assert any("own pattern" in reason for reason in judged.reasons) == (status == "ambiguous")
+    source, target, T = pair(seed=5)
+    place = np.array([0.3, -0.2, 0.1])
+    there = transform_points(T, place[None])[0] + np.array([0, 0, 4 * VOXEL])
+    two = replace(source, viewpoint=place), replace(target, viewpoint=there)
+    assert measure_information(T, *two, VOXEL).sensors_apart == pytest.approx(4 * VOXEL / source.voxel_size)
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "matches", "points", "status"),
+    [
+        (5, 1000, 500, "low_confidence"),
+        (6, 1000, 500, "ok"),
+        (3, 5, 500, "ok"),
+        (2, 5, 500, "low_confidence"),
+        (50, 1000, 29, "low_confidence"),
+        (50, 1000, 30, "ok"),
+    ],
+)
+def test_next_to_nothing_that_agrees_is_never_ok(
+    agreeing: int, matches: int, points: int, status: str
+) -> None:
+    information = replace(FIRM, num_matched=points)
+    found = scored(evidence(20.0))
+    judged = confidence.judge(found, None, 30.0, agreeing / matches, information, DecisionConfig(), matches)
+    assert judged.status == status
+    assert (status == "ok") == (judged.reasons == ())
+
+
 def test_little_overlap_and_violated_free_space_are_told_even_when_ok() -> None:
     judged = judge(evidence(2.0, overlap=0.09), 10.0, 0.05, FIRM, DecisionConfig())
     assert judged.status == "ok"

@@ -103,7 +103,8 @@ class Selection:
         information = measure_information(
             answer.T_target_source, *self._pair.clouds, self._pair.inlier_threshold
         )
-        judgement = judge(answer, rival, lead, self._support(answer), information, self._config.decision)
+        support, count = self._support(answer), len(self._pair.matched)
+        judgement = judge(answer, rival, lead, support, information, self._config.decision, count)
         decision = Decision(answer, rival, lead, information, judgement, tuple(self.hypotheses))
         for note in (answer.note, self._overruled(answer)):
             decision = decision if note is None else decision.with_note(note)

@@ -86,7 +86,9 @@ def test_no_transform_is_said_and_not_written(tmp_path, scan_files, fake_registr
     assert "nan" not in printed.out
     assert "T.txt" in printed.err and "moved.ply" in printed.err
     assert call("register", *scan_files, "--output", outputs[1], "--quiet") == 3
-    assert capsys.readouterr().out == ""
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert sum(line.startswith("failed: ") for line in printed.err.splitlines()) == 1
     assert call("register", *scan_files, "--output", outputs[3], "--json") == 3
     assert [path.exists() for path in outputs] == [False, False, False, True]
     assert json.loads(outputs[3].read_text())["T_target_source"][0][0] is None

@@ -35,3 +35,15 @@ def test_a_sensor_that_matches_itself_is_not_believed() -> None:
     result = geomoe3d.register(source, target)
     assert result.status == "ambiguous"
     assert "slide" in result.reasons[0]
+
+
+def test_a_flat_cloud_is_named() -> None:
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, (2, 1500))
+    ranges = 4 + np.sin(3 * angle) + 0.5 * np.cos(7 * angle)
+    flat = [
+        np.stack([r * np.cos(a), r * np.sin(a), 0 * a], axis=1) for r, a in zip(ranges, angle, strict=True)
+    ]
+    result = geomoe3d.register(*flat)
+    assert not result.ok
+    assert sum("is flat: all its points lie in one plane" in reason for reason in result.reasons) == 2

@@ -63,7 +63,11 @@ class _Outputs:
 @click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
 @click.option("--force", is_flag=True, help="Replace output files that exist.")
-@click.option("--quiet", is_flag=True, help="No progress; print the four rows of the matrix alone.")
+@click.option(
+    "--quiet",
+    is_flag=True,
+    help="No progress; the four rows of the matrix alone, and one line on stderr where it is not ok.",
+)
 @traceback_option
 @click.pass_context
 def command(
@@ -146,6 +150,8 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
 
         if has_transform(answer):
             click.echo(transform_text(answer.T_target_source, []), nl=False)
+        if not answer.ok:
+            click.echo(f"{answer.status.replace('_', ' ')}: {(*answer.reasons, 'no reason')[0]}", err=True)
     else:
         from geomoe3d.cli.summary import summary
 

@@ -7,10 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from geomoe3d.config import PreparationConfig
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.types import PreparedCloud
 
+_FLAT = 1e-6  # thickness over extent of what has no surface in space
 _FEW_VOXELS = 100  # far below what the chosen grid aims at
 
 
@@ -42,6 +45,13 @@ def remarks(
         yield "source and target are the same file"
     if judgement.status == "ok":
         return
+    for cloud in described:
+        spread = np.linalg.svd(cloud.points - cloud.points.mean(0), compute_uv=False)
+        if spread[2] < _FLAT * spread[0]:
+            yield (
+                f"'{cloud.name}' is flat: all its points lie in one plane, as those of a 2-D scanner do; this method "
+                "compares surfaces in space, so give scans with height"
+            )
     fewest = min(described, key=len)
     if len(fewest) < _FEW_VOXELS:
         yield (

@@ -138,3 +138,16 @@ def test_an_item_that_kills_every_worker_is_given_up_alone():
 def test_a_worker_is_held_to_its_memory():
     with pytest.raises(MemoryError):
         list(run_surviving(ProcessPool(1, memory_limit=1 << 30), hungry, [0]))
+
+
+def test_a_worker_that_outlives_its_broken_pool_is_ended():
+    """One that waits for work that never comes would be waited for in turn."""
+    pool = ProcessPool(2)
+    executor = pool.open()
+    list(executor.map(square, range(4)))
+    workers = executor._known.started
+    assert workers
+    assert all(worker.is_alive() for worker in workers)
+    pool.close(broken=True)
+    assert not any(worker.is_alive() for worker in workers)
+    assert pool.opened is None

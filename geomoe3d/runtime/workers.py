@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
-from multiprocessing import get_context
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 from geomoe3d.errors import DependencyError, InputError, OutputError
@@ -63,8 +63,14 @@ class Pool:
         """Tasks to keep under way."""
         return 1
 
-    def close(self) -> None:
-        """Let go of the executor; tasks that have not begun are dropped."""
+    def close(self, *, broken: bool = False) -> None:
+        """Let go of the executor; tasks that have not begun are dropped.
+
+        Args:
+            broken: it has lost a process, and its others are ended too.
+        """
+        if broken and isinstance(self.opened, _LimitedPool):
+            self.opened.kill()
         if self.opened is not None:
             self.opened.shutdown(wait=True, cancel_futures=True)
         self.opened = None
@@ -122,12 +128,36 @@ class ProcessPool(Pool):
         return 2 * self._workers
 
 
+class _KnownProcesses(SpawnContext):
+    """Remembers every process that is started through it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.started: list[SpawnProcess] = []
+
+    def Process(self, *args: Any, **named: Any) -> SpawnProcess:  # type: ignore[override]
+        process = SpawnProcess(*args, **named)
+        self.started.append(process)
+        return process
+
+
 class _LimitedPool(ProcessPoolExecutor):
     """Processes are started by `submit`: the limit of threads must hold then."""
 
     def __init__(self, workers: int, threads: int, **named: Any) -> None:
-        super().__init__(workers, mp_context=get_context("spawn"), **named)
+        self._known = _KnownProcesses()
+        super().__init__(workers, mp_context=self._known, **named)
         self._threads = threads
+
+    def kill(self) -> None:
+        """End every process; for a pool that has lost one, whose others are of no more use.
+
+        The library ends them itself, but one that was just being started may escape it and wait for work for ever,
+        and `shutdown` for it.
+        """
+        for process in self._known.started:
+            if process.is_alive():
+                process.kill()
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         with _limited_threads(self._threads):
@@ -183,7 +213,7 @@ class DaskPool(Pool):
         held = f", each held to {least / 2**30:.1f} GiB or more" if least else ""
         return f"{len(workers)} worker{'s' * (len(workers) != 1)} of the scheduler{held}"
 
-    def close(self) -> None:
+    def close(self, *, broken: bool = False) -> None:
         """See `Pool`."""
         if self.opened is not None:
             self.opened.shutdown(wait=False)
@@ -225,7 +255,7 @@ def run_surviving(
             done, _ = wait(waiting, return_when=FIRST_COMPLETED)
             if any(isinstance(_failure(future), BrokenExecutor) for future in done):
                 done, _ = wait(waiting)
-                pool.close()
+                pool.close(broken=True)
             for future in done:
                 item, deaths = waiting.pop(future)
                 error = _failure(future)

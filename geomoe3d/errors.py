@@ -20,9 +20,13 @@ class InputError(GeoMoE3DError, ValueError):
 class MissingFileError(InputError, FileNotFoundError):
     """There is no such file or folder to read."""
 
+    __new__ = OSError.__new__  # type: ignore[assignment]  # what unpickles may ask for it by the first base
+
 
 class ForbiddenFileError(InputError, PermissionError):
     """A file or folder may not be read."""
+
+    __new__ = OSError.__new__  # type: ignore[assignment]  # what unpickles may ask for it by the first base
 
 
 class FormatError(InputError):
@@ -52,6 +56,8 @@ class ConfigError(GeoMoE3DError, ValueError):
 class MissingConfigError(ConfigError, FileNotFoundError):
     """There is no such configuration file."""
 
+    __new__ = OSError.__new__  # type: ignore[assignment]  # what unpickles may ask for it by the first base
+
 
 class CheckpointError(GeoMoE3DError, ValueError):
     """Weights or a checkpoint do not fit: wrong architecture, broken hash, foreign format."""
@@ -60,6 +66,8 @@ class CheckpointError(GeoMoE3DError, ValueError):
 class MissingWeightsError(CheckpointError, FileNotFoundError):
     """There are no such weights, or no such checkpoint."""
 
+    __new__ = OSError.__new__  # type: ignore[assignment]  # what unpickles may ask for it by the first base
+
 
 class DependencyError(GeoMoE3DError, ImportError):
     """An optional part is not installed; the message gives the command that installs it."""
@@ -67,6 +75,9 @@ class DependencyError(GeoMoE3DError, ImportError):
 
 def cannot_read(error: OSError, message: str) -> InputError:
     """The class of `InputError` for what the system says: missing, forbidden or anything else."""
+    kind: type[InputError] = InputError
     if isinstance(error, FileNotFoundError):
-        return MissingFileError(message)
-    return (ForbiddenFileError if isinstance(error, PermissionError) else InputError)(message)
+        kind = MissingFileError
+    elif isinstance(error, PermissionError):
+        kind = ForbiddenFileError
+    return kind(message)

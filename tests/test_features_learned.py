@@ -165,6 +165,7 @@ def test_shared_points_of_a_drawn_pair_are_the_same_places(shards: Path) -> None
         assert np.array_equal(drawn.queries[side], again.queries[side])
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_training_learns_one_pair_and_goes_on_where_it_was(shards: Path, tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     from geomoe3d.training.descriptor import DescriptorRun, DescriptorTrainConfig

@@ -9,10 +9,11 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import part_options
+from geomoe3d.cli.parts import configuration_options, worker_options
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
+    from geomoe3d.config import RegistrationConfig
 
 _SHOWN = 20
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red", "error": "red"}
@@ -21,24 +22,8 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.command(context_settings=HELP, short_help="Register a table of pairs, on one machine or a cluster.")
 @click.argument("pairs", metavar="PAIRS.csv")
 @click.argument("out", metavar="OUT")
-@click.option(
-    "--workers",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Parallel processes on this machine. [as many as cores and memory allow]",
-)
-@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead.")
-@click.option("--voxel-size", metavar="LENGTH", help="Edge of a voxel, in the clouds' unit. [chosen]")
-@click.option("--seed", metavar="N", help="Random seed: the same seed, the same answers. [0]")
-@click.option("--config", "config_file", metavar="FILE", help="Configuration (YAML); see `geomoe3d config`.")
-@click.option(
-    "--set",
-    "assignments",
-    metavar="KEY=VALUE",
-    multiple=True,
-    help="One value of the configuration; repeatable.",
-)
-@part_options
+@worker_options
+@configuration_options
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
 @click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
 @click.option("--fresh", is_flag=True, help="Delete the results of an earlier batch in OUT first.")
@@ -55,11 +40,7 @@ def command(
     out: str,
     workers: int | None,
     scheduler: str | None,
-    voxel_size: str | None,
-    seed: str | None,
-    config_file: str | None,
-    assignments: tuple[str, ...],
-    parts: list[str],
+    config: RegistrationConfig,
     transforms: bool,
     page: bool,
     fresh: bool,
@@ -75,13 +56,8 @@ def command(
     interrupted batch continues when it is started again. A file that cannot be read affects its own pairs
     only. Exit code 0 if every pair is ok, 3 if not, 2 for unusable input.
     """
-    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
-    from geomoe3d.config import load_config
-
-    named = {"voxel_size": voxel_size, "seed": seed}
-    given = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(config_file, [*assignments, *given, *parts])
     from geomoe3d.batch.run import ALL_THAT_FIT, register_pairs
+    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
 
     with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:
         report = register_pairs(

@@ -9,10 +9,11 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import part_options
+from geomoe3d.cli.parts import configuration_options, worker_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 
 if TYPE_CHECKING:
+    from geomoe3d.config import RegistrationConfig
     from geomoe3d.multiway.model import SceneModel
 
 _SHOWN = 20
@@ -46,24 +47,8 @@ _SHOWN = 20
     metavar="N",
     help=f"Rounds of further pairs for scans that are not connected yet. [{MOST_ROUNDS}]",
 )
-@click.option(
-    "--workers",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Parallel processes on this machine. [as many as cores and memory allow]",
-)
-@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead.")
-@click.option("--voxel-size", metavar="LENGTH", help="Edge of a voxel, for all scans. [chosen]")
-@click.option("--seed", metavar="N", help="Random seed: the same seed, the same answers. [0]")
-@click.option("--config", "config_file", metavar="FILE", help="Configuration (YAML); see `geomoe3d config`.")
-@click.option(
-    "--set",
-    "assignments",
-    metavar="KEY=VALUE",
-    multiple=True,
-    help="One value of the configuration; repeatable.",
-)
-@part_options
+@worker_options
+@configuration_options
 @click.option("--sequence", is_flag=True, help="The scans are in the order in which they were taken.")
 @click.option(
     "--initial",
@@ -95,11 +80,7 @@ def command(
     model_voxel_size: float | None,
     workers: int | None,
     scheduler: str | None,
-    voxel_size: str | None,
-    seed: str | None,
-    config_file: str | None,
-    assignments: tuple[str, ...],
-    parts: list[str],
+    config: RegistrationConfig,
     page: bool,
     sequence: bool,
     initial: str | None,
@@ -117,15 +98,11 @@ def command(
     all scans are in one group, 3 if not, 2 for unusable input.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
-    from geomoe3d.config import load_config
 
     if len(inputs) < 2:
         raise click.UsageError("give at least one folder of scans, or two scans, and OUT last")
     if model_voxel_size is not None and not model_voxel_size > 0:
         raise click.UsageError(f"--model-voxel-size must be positive, found {model_voxel_size}")
-    named = {"voxel_size": voxel_size, "seed": seed}
-    given = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(config_file, [*assignments, *given, *parts])
     from geomoe3d.batch.run import ALL_THAT_FIT
     from geomoe3d.multiway.run import register_scans
 

@@ -1,4 +1,4 @@
-"""Options by which every verb that registers pairs takes parts: those that come with geomoe3d, or your own."""
+"""Options that every verb that registers pairs has: its configuration with the parts in it, and its workers."""
 
 from __future__ import annotations
 
@@ -19,22 +19,49 @@ _PARTS = (
 )
 
 
-def part_options(command: Command) -> Command:
-    """Adds the options; the command gets them as ``parts``, a list of ``key=value`` of the configuration.
+_SETTINGS = (
+    ("--voxel-size", "voxel_size", "LENGTH", "Edge of the voxel grid, in the clouds' unit. [chosen]"),
+    ("--seed", "seed", "N", "Random seed: the same seed, the same answers. [0]"),
+    ("--config", "config_file", "FILE", "Configuration (YAML); `geomoe3d config` prints one."),
+)
 
-    Each takes a name or a class of the user's own, ``file.py:Class`` or ``module:Class``.
+
+def worker_options(command: Command) -> Command:
+    """Adds ``--workers`` and ``--scheduler``."""
+    scheduler = click.option(
+        "--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead."
+    )(command)
+    result: Command = click.option(
+        "--workers",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Parallel processes on this machine. [as many as cores and memory allow]",
+    )(scheduler)
+    return result
+
+
+def configuration_options(command: Command) -> Command:
+    """Adds the options; the command gets what they come to as ``config``, a `RegistrationConfig`.
+
+    An option overrides ``--set``, which overrides the file. A part is a name or a class of the user's own,
+    ``file.py:Class`` or ``module:Class``.
     """
 
     @wraps(command)
-    def with_parts(*args: Any, **named: Any) -> Any:
+    def with_config(*args: Any, **named: Any) -> Any:
+        from geomoe3d.config import load_config
+
         given = [(option, key, named.pop(f"part_{option}")) for option, key, _ in _PARTS]
         given = [(option, key, value) for option, key, value in given if value is not None]
         scorers = named.pop("part_scorers")
         _check([(option, value) for option, _, value in given] + [("scorer", name) for name in scorers])
-        named["parts"] = [f"{key}={value}" for _, key, value in given]
+        settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
+        settings += [(key, value) for _, key, value in given]
+        chosen = [f"{key}={value}" for key, value in settings if value is not None]
         if scorers:
-            named["parts"].append(f"scoring.scorers=[{', '.join(scorers)}]")
-        return command(*args, **named)
+            chosen.append(f"scoring.scorers=[{', '.join(scorers)}]")
+        file, assignments = named.pop("config_file"), named.pop("assignments")
+        return command(*args, **named, config=load_config(file, [*assignments, *chosen]))
 
     wrapped: Any = click.option(
         "--scorer",
@@ -42,9 +69,18 @@ def part_options(command: Command) -> Command:
         metavar="NAME",
         multiple=True,
         help="What scores the hypotheses: surfaces, network, or your own; repeatable. [surfaces, network]",
-    )(with_parts)
+    )(with_config)
     for option, _, text in reversed(_PARTS):
         wrapped = click.option(f"--{option}", f"part_{option}", metavar="NAME", help=text)(wrapped)
+    wrapped = click.option(
+        "--set",
+        "assignments",
+        metavar="KEY=VALUE",
+        multiple=True,
+        help="One value of the configuration; repeatable.",
+    )(wrapped)
+    for option, name, metavar, text in reversed(_SETTINGS):
+        wrapped = click.option(option, name, metavar=metavar, help=text)(wrapped)
     result: Command = wrapped
     return result
 

@@ -12,9 +12,10 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import part_options
+from geomoe3d.cli.parts import configuration_options
 
 if TYPE_CHECKING:
+    from geomoe3d.config import RegistrationConfig
     from geomoe3d.decision.explanation import Explanation
     from geomoe3d.result import RegistrationResult
 
@@ -33,11 +34,7 @@ class _Outputs:
 @click.command(context_settings=HELP, short_help="Lay one scan on another, and say how sure.")
 @click.argument("source", metavar="SOURCE")
 @click.argument("target", metavar="TARGET")
-@click.option("--voxel-size", metavar="LENGTH", help="Edge of the voxel grid, in the clouds' unit. [chosen]")
-@click.option("--seed", metavar="N", help="Same seed, same answer. [0]")
-@click.option("--config", "config_file", metavar="FILE", help="YAML file; `geomoe3d config` prints one.")
-@click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One value of it; repeatable.")
-@part_options
+@configuration_options
 @click.option("--weights", metavar="FILE", help="Trained network (.safetensors): scorer or filter, as it is.")
 @click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
@@ -74,11 +71,7 @@ def command(
     context: click.Context,
     source: str,
     target: str,
-    voxel_size: str | None,
-    seed: str | None,
-    config_file: str | None,
-    assignments: tuple[str, ...],
-    parts: list[str],
+    config: RegistrationConfig,
     weights: str | None,
     correspondences: str | None,
     initial: str | None,
@@ -99,11 +92,7 @@ def command(
     guess is needed. The motion is given in the files' own coordinates, with a status: ok,
     low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
     """
-    from geomoe3d.config import load_config
 
-    named = {"voxel_size": voxel_size, "seed": seed}
-    given = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(config_file, [*assignments, *given, *parts])
     outputs = _Outputs(output, aligned, aligned_precision, picture, page)
     _check_outputs(outputs, (source, target), force)
     if show:

@@ -120,7 +120,7 @@ def test_commands_in_the_docs_have_the_options_that_they_name(page):
     from geomoe3d.cli.main import geomoe3d as program
 
     for words in commands(page):
-        command, context = program, click.Context(program, info_name="geomoe3d")
+        command, context = program, click.Context(program, info_name="geomoe3d", **program.context_settings)
         while isinstance(command, click.Group) and words and not words[0].startswith("-"):
             command = command.get_command(context, words[0])
             assert command is not None, words

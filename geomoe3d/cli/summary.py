@@ -15,7 +15,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 _MEANING = {
     "ok": "the transform is reliable",
     "low_confidence": "the transform may be wrong",
-    "ambiguous": "a different transform fits about as well",
+    "ambiguous": "more than one transform fits about as well",
     "failed": "no reliable transform was found",
 }
 

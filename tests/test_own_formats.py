@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from cloud_files import small_cloud
 
+from geomoe3d.batch.task import Settings
 from geomoe3d.clouds.formats import registry
 from geomoe3d.clouds.io import load_points, save_points, use_part
 from geomoe3d.clouds.loading import read_raw
+from geomoe3d.config import RegistrationConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import ConfigError, FormatError
 
@@ -67,8 +69,13 @@ def test_the_example_reads_and_writes_for_the_command_line(tmp_path: Path) -> No
     expected = source.file_points[::4] @ found[:3, :3].T + found[:3, 3]
     np.testing.assert_allclose([row["p"] for row in moved], expected, atol=1e-9)
     (tmp_path / "pairs.csv").write_text("source,target\nsource.jsonl,target.jsonl\n")
-    done = run(tmp_path, "batch", "pairs.csv", "out", *own, "--workers", "1", "--no-cache")
-    assert done.returncode == 0, done.stderr
+    batch = ["batch", "pairs.csv", "out", "--workers", "1", "--no-cache"]
+    assert run(tmp_path, *batch, *own).returncode == 0
+    done = run(tmp_path, *batch)  # another reader, another batch
+    assert done.returncode == 2 and "they differ in readers..jsonl" in done.stderr, done.stderr
+    (tmp_path / "mine.py").write_text(EXAMPLE.read_text() + "# other code\n")
+    done = run(tmp_path, *batch, *own)
+    assert done.returncode == 2 and "readers..jsonl.code" in done.stderr, done.stderr
     done = run(tmp_path, "register", "source.jsonl", "target.jsonl", "--reader", "mine.py:read_line")
     assert done.returncode == 2 and "did you mean 'read_lines'" in done.stderr
 
@@ -78,6 +85,7 @@ def test_in_python_and_in_place_of_ours(tmp_path: Path) -> None:
     use_part("reader", f"{EXAMPLE}:read_lines")
     (tmp_path / "a.jsonl").write_text('{"p": [1, 2, 3], "ring": 7}\n')
     assert read_raw(tmp_path / "a.jsonl").fields["ring"] == [7]
+    assert Settings.of(RegistrationConfig(), "").readers == (f"{EXAMPLE}:read_lines",)  # also on a cluster
     (tmp_path / "a.jsonl").write_text('{"p": [1, 2]\n')
     with pytest.raises(FormatError, match="line 1 is no point"):
         load_points(tmp_path / "a.jsonl")

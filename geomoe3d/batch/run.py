@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from geomoe3d.batch.task import Settings, Task, as_record, make_ready, register_
 from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.features.cache import CACHE_VARIABLE
+from geomoe3d.features.cache import CACHE_VARIABLE, default_cache_folder
 from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
@@ -88,8 +88,10 @@ class Labour:
     scheduler: str | None = None
     cache: str | None = None
 
-    def check(self) -> None:
-        """Refuse what needs no look at the pairs.
+    def checked(self) -> Labour:
+        """The same with the folder of the cache found, once for all workers of this machine.
+
+        What needs no look at the pairs is refused.
 
         Raises:
             InputError: workers and a scheduler at once.
@@ -102,6 +104,9 @@ class Labour:
             cache = os.environ.get(CACHE_VARIABLE)
         if cache:
             check_can_be_folder(Path(cache), "the cache of features is a folder: give one, or none")
+        if self.cache is None and self.scheduler is None:
+            return replace(self, cache=str(default_cache_folder() or ""))
+        return self
 
     def pool(self, each: int, say: Callable[[str], None]) -> Pool:
         """Where to run, after saying how much memory it takes.
@@ -191,8 +196,7 @@ def register_pairs(
     rows = read_pairs(pairs) if is_table else as_rows(pairs)  # type: ignore[arg-type]
     folder = Path(out)
     config = resolved(config)
-    labour = Labour(workers, scheduler, cache)
-    labour.check()
+    labour = Labour(workers, scheduler, cache).checked()
     store = BatchStore(folder, config, fresh=fresh)
     check_extras(folder, [row.id for row in rows], transforms=transforms, page=page)
     records, kept = work(rows, store, config, labour, retry, progress or None, say)

@@ -32,6 +32,7 @@ from geomoe3d.batch.folder import (
     remove_batch,
 )
 from geomoe3d.batch.table import MATRIX_COLUMNS
+from geomoe3d.clouds.formats.registry import own_readers
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import FormatError, InputError, OutputError
@@ -108,6 +109,8 @@ class BatchStore:
             "seed": config.seed,
         }
         self._identity = {"format": FORMAT, **self._shared, "pipeline": Pipeline(resolved(config)).identity()}
+        readers = own_readers()
+        self._identity |= {"readers": readers} if readers else {}
         there = check_can_be_folder(folder, "results are written into a folder")
         if not os.access(there, os.W_OK | os.X_OK):
             raise OutputError(f"cannot write into '{folder}': no right to write into '{there}'")

@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 from geomoe3d.batch.table import PairRow
+from geomoe3d.clouds.formats.registry import reader_names, use_part
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import DependencyError, GeoMoE3DError, OutputError
@@ -32,16 +33,19 @@ class Settings:
         config: the complete configuration as JSON.
         versions: of the deciding libraries as JSON; a worker with others is refused.
         cache: folder of described clouds; None: the user's own on the worker's machine; empty: none.
+        readers: of the user's own, by name.
     """
 
     config: str
     versions: str
     cache: str | None
+    readers: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, config: RegistrationConfig, cache: str | None) -> Settings:
         """Those of this process."""
-        return cls(config.model_dump_json(), json.dumps(library_versions(), sort_keys=True), cache)
+        versions = json.dumps(library_versions(), sort_keys=True)
+        return cls(config.model_dump_json(), versions, cache, reader_names())
 
 
 @dataclass(frozen=True)
@@ -105,16 +109,19 @@ def _registrar(settings: Settings) -> Registrar:
             f"a worker runs other versions than this process, so its answers could differ: {here} there, "
             f"{settings.versions} here; install the same everywhere"
         )
+    for name in settings.readers:
+        use_part("reader", name)
     config = build_config(RegistrationConfig, json.loads(settings.config))
     return Registrar(config, cache=open_cache(settings.cache))
 
 
 def open_cache(folder: str | None) -> FeatureCache | None:
     """The cache in a folder; None: the user's own; empty, or a folder that cannot be made: none."""
-    if folder == "":
+    place = default_cache_folder() if folder is None else folder
+    if not place:
         return None
     try:
-        return FeatureCache(folder or default_cache_folder())
+        return FeatureCache(place)
     except OutputError as error:
         warnings.warn(f"features are not cached: {error}", RuntimeWarning, stacklevel=2)
         return None

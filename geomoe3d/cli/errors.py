@@ -10,6 +10,7 @@ import os
 import shlex
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -43,6 +44,7 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
 
         return shell_complete(command, {}, name, f"_{name.upper()}_COMPLETE", completing)
     ensure_home()
+    warnings.showwarning = _say_warning
     words = list(sys.argv[1:] if arguments is None else arguments)
     wanted: dict[str, Any] = {
         _TRACEBACK: os.environ.get("GEOMOE3D_TRACEBACK", "") not in ("", "0"),
@@ -74,6 +76,11 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
         if wanted[_TRACEBACK]:
             traceback.print_exc()
         return _explain(error, bool(wanted[_TRACEBACK]))
+
+
+def _say_warning(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+    """A warning in plain words, without the place in the program that gave it."""
+    click.echo(f"warning: {message}", err=True)
 
 
 def command_line() -> str:

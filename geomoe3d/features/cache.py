@@ -25,7 +25,7 @@ from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.features.base import Descriptor
 from geomoe3d.runtime.files import write_atomically
-from geomoe3d.runtime.home import ensure_home, own_temporary_folder
+from geomoe3d.runtime.home import ensure_home, folder_for
 from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
 from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
@@ -39,10 +39,11 @@ _COUNTS = ("num_input", "num_non_finite", "num_duplicates", "num_isolated")
 CACHE_VARIABLE = "GEOMOE3D_CACHE"
 
 
-def default_cache_folder() -> Path:
+def default_cache_folder() -> Path | None:
     """The user's own: ``GEOMOE3D_CACHE``, else ``geomoe3d`` in the system's folder for caches.
 
-    Where there is no such folder and none can be made, one of the user's own among temporary files.
+    Where that cannot be made or written, one of the user's own among temporary files, else None; both are
+    said once, by a RuntimeWarning.
     """
     given = os.environ.get(CACHE_VARIABLE)
     if given:
@@ -50,14 +51,7 @@ def default_cache_folder() -> Path:
     base = os.environ.get("XDG_CACHE_HOME")
     ensure_home()
     folder = (Path(base) if base else Path.home() / ".cache") / "geomoe3d" / "described"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    except OSError:
-        pass
-    temporary = own_temporary_folder()
-    return folder if temporary is None else temporary / "described"
+    return folder_for(folder, "described", "descriptions of scans are", CACHE_VARIABLE)
 
 
 class FeatureCache:
@@ -76,6 +70,7 @@ class FeatureCache:
         if max_bytes <= 0:
             raise InputError(f"a cache of at most {max_bytes} bytes holds nothing; give a positive limit")
         self.folder, self.max_bytes = Path(folder), max_bytes
+        self._complained = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -103,7 +98,9 @@ class FeatureCache:
             write_atomically(path, lambda temporary: _write(temporary, made), force=True)
             self._shrink(keep=path)
         except OSError as error:  # OutputError is one
-            warnings.warn(f"features are not kept: {error}", RuntimeWarning, stacklevel=2)
+            if not self._complained:
+                self._complained = True
+                warnings.warn(f"features are not kept in '{self.folder}': {error}", RuntimeWarning, stacklevel=2)
         return made
 
     def _shrink(self, keep: Path) -> None:

@@ -110,8 +110,7 @@ def register_scans(
     if e57:
         require_pye57()
     paths, folder = as_paths(scans), Path(out)
-    labour = Labour(workers, scheduler, cache)
-    labour.check()
+    labour = Labour(workers, scheduler, cache).checked()
     check_folder(folder, paths, page=page)
     say = say or (lambda text: None)
     clock = StageClock(say)
@@ -129,7 +128,7 @@ def register_scans(
         poses = InitialPoses(given, shift, turn)
     store = BatchStore(folder / "pairs", config, fresh=fresh)
     if store.begins:
-        _try_out(labour, found, Settings.of(config, cache) if fresh else None)
+        _try_out(labour, found, Settings.of(config, labour.cache) if fresh else None)
     survey = Survey(found, config, store, labour, progress or None, say, sequence=sequence, initial=poses)
     survey.describe(unusable)
     store.begin()

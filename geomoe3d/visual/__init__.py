@@ -5,6 +5,6 @@ All three take one `view.RegistrationView`. `picture.save_picture` needs matplot
 display. Nothing here changes a number of the result.
 """
 
-from geomoe3d.runtime.home import ensure_home
+from geomoe3d.runtime.home import ensure_font_cache
 
-ensure_home()
+ensure_font_cache()

@@ -83,6 +83,25 @@ def use_part(kind: Kind, spec: str) -> None:
     os.environ[VARIABLES[kind]] = ";".join(dict.fromkeys([*known, spec]))
 
 
+def own_readers() -> dict[str, dict[str, str]]:
+    """By suffix, who reads it in place of ours: its name and a hash of its code."""
+    from geomoe3d.runtime.sources import source_hash
+
+    take_inherited()
+    found: dict[str, dict[str, str]] = {}
+    for suffix, part in READERS.items():
+        kind = part if hasattr(part, "__qualname__") else type(part)
+        if not kind.__module__.startswith("geomoe3d."):
+            name = f"{kind.__module__.rpartition('.')[2]}:{kind.__qualname__}"
+            found[suffix] = {"reader": name, "code": source_hash(kind.__module__)}
+    return found
+
+
+def reader_names() -> tuple[str, ...]:
+    """The names under which `use_part` took them, so that workers elsewhere can take them too."""
+    return tuple(one for one in os.environ.get(VARIABLES["reader"], "").split(";") if one)
+
+
 def take_inherited() -> None:
     """Take the parts that the variables name, those of a parent process among them."""
     for kind, variable in VARIABLES.items():

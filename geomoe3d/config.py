@@ -49,7 +49,7 @@ class PreparationConfig(Section):
     viewpoint: Literal["auto", "origin", "guess", "centroid"] = Field(
         "auto",
         description="where the sensor stood, to which normals turn: the file's origin, a guess from what can "
-        "be seen, the centroid, or auto: the origin if within one extent of both clouds, else a guess",
+        "be seen, the centroid, or auto: the origin if near both clouds, else where the files say, else a guess",
     )
 
 

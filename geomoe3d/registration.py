@@ -247,7 +247,8 @@ class Registrar:
         if ratio is None or not self.pipeline.scorers:
             return None
         clock("units")
-        smaller = replace(source, points=source.points / ratio, origin=source.origin / ratio)
+        sensor = None if source.sensor is None else source.sensor / ratio
+        smaller = replace(source, points=source.points / ratio, origin=source.origin / ratio, sensor=sensor)
         if not self.register(smaller, target).ok:
             return None
         return (

@@ -31,6 +31,7 @@ class PointCloud:
         name: what to call the cloud in messages.
         num_non_finite: rows dropped because a coordinate was NaN or infinite.
         notes: sentences on what of the file was not taken as it stands.
+        sensor: (3,) where the file says that its one sensor stood, file coordinates, or None.
     """
 
     points: FloatArray
@@ -40,6 +41,7 @@ class PointCloud:
     name: str = "cloud"
     num_non_finite: int = 0
     notes: tuple[str, ...] = ()
+    sensor: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.points)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import struct
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +22,20 @@ from geomoe3d.geometry.se3 import make_transform
 UTM = np.array([583394.0, 5283100.0, 498.0])
 STEP = np.array([5.0, 6.0, 7.0])
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def absent(reason: str) -> None:
+    """Skip a test for want of something; where everything has to be there, as in CI, it fails."""
+    if os.environ.get("CI"):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def needed(package: str) -> Any:
+    """A package of others, or no test without it (see `absent`)."""
+    if find_spec(package) is None:
+        absent(f"{package} is not installed; scripts/test.sh installs it")
+    return import_module(package)
 
 
 def cloud(num: int = 200, seed: int = 0, center: np.ndarray | float = 0.0) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_files import UTM, cloud, rigid, small_cloud, unit_vectors
+from cloud_files import UTM, absent, cloud, needed, rigid, small_cloud, unit_vectors
 
 from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.raw import RawCloud
@@ -24,7 +24,7 @@ COLORS = np.random.default_rng(2).integers(1, 256, (100, 3)) / 255
 def run(*command: str | Path, folder: Path) -> str:
     """The output of a program, which has to be there and to end well."""
     if shutil.which(str(command[0])) is None:
-        pytest.skip(f"{command[0]} is not installed; scripts/test.sh installs it where there is apt-get")
+        absent(f"{command[0]} is not installed; scripts/test.sh installs it where there is apt-get")
     environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
     done = subprocess.run(
         [str(word) for word in command],
@@ -130,7 +130,7 @@ def test_cloudcompare_applies_a_transform(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_plyfile_finds_every_property(tmp_path: Path, moved: np.ndarray, precision: str) -> None:
-    plyfile = pytest.importorskip("plyfile")
+    plyfile = needed("plyfile")
     save_aligned(tmp_path / "a.ply", tmp_path / "source.npz", rigid(), precision=precision)
     vertex = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"]
     found = np.stack([vertex[axis] for axis in "xyz"], axis=1)
@@ -141,7 +141,7 @@ def test_plyfile_finds_every_property(tmp_path: Path, moved: np.ndarray, precisi
 
 
 def test_lists_and_text_of_plyfile_are_read(tmp_path: Path) -> None:
-    plyfile = pytest.importorskip("plyfile")
+    plyfile = needed("plyfile")
     rows = np.empty(50, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("views", object), ("ring", "u1")])
     rows["x"], rows["y"], rows["z"] = small_cloud(50).T
     rows["ring"] = np.arange(50)
@@ -157,7 +157,7 @@ def test_lists_and_text_of_plyfile_are_read(tmp_path: Path) -> None:
 
 
 def test_small_gicp_and_open3d_find_every_point(tmp_path: Path, moved: np.ndarray) -> None:
-    small_gicp, o3d = pytest.importorskip("small_gicp"), pytest.importorskip("open3d")
+    small_gicp, o3d = needed("small_gicp"), needed("open3d")
     np.savez(tmp_path / "floats.npz", points=small_cloud(), intensity=np.arange(100, dtype=np.float32))
     save_aligned(tmp_path / "floats.ply", tmp_path / "floats.npz", rigid())
     found = small_gicp.read_ply(str(tmp_path / "floats.ply"))  # it takes no bytes, so no colours
@@ -170,7 +170,7 @@ def test_small_gicp_and_open3d_find_every_point(tmp_path: Path, moved: np.ndarra
 
 
 def test_pye57_reads_posed_scans(tmp_path: Path) -> None:
-    pye57 = pytest.importorskip("pye57")
+    pye57 = needed("pye57")
     clouds = [
         RawCloud(small_cloud(40, k), unit_vectors(40, k), COLORS[:40], fields={"intensity": np.arange(40.0)})
         for k in range(2)
@@ -196,9 +196,41 @@ def test_pye57_reads_posed_scans(tmp_path: Path) -> None:
     np.testing.assert_allclose(together.normals, np.concatenate(turned), atol=1e-9)
 
 
+# ---- MeshLab, through its own package ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_meshlab_opens_an_aligned_cloud(tmp_path: Path, moved: np.ndarray, precision: str) -> None:
+    pymeshlab = needed("pymeshlab")
+    save_aligned(tmp_path / "a.ply", tmp_path / "source.npz", rigid(), precision=precision)
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.load_new_mesh(str(tmp_path / "a.ply"))
+    found = meshes.current_mesh()
+    np.testing.assert_allclose(found.vertex_matrix(), moved, atol=1e-5 if precision == "single" else 1e-9)
+    np.testing.assert_allclose(found.vertex_normal_matrix(), unit_vectors(100) @ rigid()[:3, :3].T, atol=1e-6)
+    np.testing.assert_allclose(found.vertex_color_matrix()[:, :3], COLORS, atol=1e-6)
+    np.savez(tmp_path / "flags.npz", points=small_cloud(), flags=np.arange(100, dtype=np.int32))
+    save_aligned(tmp_path / "flags.ply", tmp_path / "flags.npz", rigid(), precision=precision)
+    meshes.load_new_mesh(str(tmp_path / "flags.ply"))
+    assert meshes.current_mesh().vertex_number() == 100  # flags would hide half of them
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".stl", ".ply", ".glb"])
+def test_meshlab_opens_an_aligned_mesh(tmp_path: Path, suffix: str) -> None:
+    pymeshlab, trimesh = needed("pymeshlab"), needed("trimesh")
+    save_aligned(tmp_path / f"a{suffix}", trimesh.creation.box(), rigid())
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.load_new_mesh(str(tmp_path / f"a{suffix}"))
+    found = meshes.current_mesh().transformed_vertex_matrix()
+    expected = transform_points(rigid(), trimesh.creation.box().vertices)
+    np.testing.assert_allclose(
+        [found.min(axis=0), found.max(axis=0)], [expected.min(axis=0), expected.max(axis=0)], atol=1e-5
+    )
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".off", ".stl", ".ply", ".glb"])
 def test_trimesh_opens_an_aligned_mesh(tmp_path: Path, suffix: str) -> None:
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = needed("trimesh")
     box = trimesh.creation.box()
     save_aligned(tmp_path / f"a{suffix}", box, rigid())
     found = trimesh.load(tmp_path / f"a{suffix}", force="mesh")

@@ -72,6 +72,7 @@ def test_e57_scans_are_merged_in_the_global_frame(tmp_path: Path) -> None:
         scan.update({f"color{name}": part[:, k] for k, name in enumerate(("Red", "Green", "Blue"))})
     write_e57(tmp_path / "a.e57", scans, poses)
     loaded = load_points(tmp_path / "a.e57")
+    assert loaded.sensor is None  # two of them
     expected = np.concatenate([R[0].apply(first[~invalid]) + UTM, R[1].apply(second) + UTM + STEP])
     np.testing.assert_allclose(loaded.file_points, expected, rtol=0, atol=1e-8)
     np.testing.assert_allclose(loaded.colors, np.concatenate([colors[:40][~invalid], colors[40:]]) / 65535)
@@ -83,7 +84,8 @@ def test_e57_of_pye57(tmp_path: Path) -> None:
     with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
         data = {f"cartesian{axis}": points[:, k].copy() for k, axis in enumerate("XYZ")}
         file.write_scan_raw(data, rotation=np.array([1.0, 0, 0, 0]), translation=STEP)
-    assert np.array_equal(load_points(tmp_path / "a.e57").file_points, points + STEP)
+    loaded = load_points(tmp_path / "a.e57")
+    assert np.array_equal(loaded.file_points, points + STEP) and np.array_equal(loaded.sensor, STEP)
 
 
 def test_truncated_e57(tmp_path: Path) -> None:

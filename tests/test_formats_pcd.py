@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from cloud_files import UTM, cloud, fails, pcd, small_cloud, unit_vectors
 
-from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.clouds.loading import read_raw
+from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.registration import Registrar
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -130,6 +132,43 @@ def test_all_modes_give_the_same_cloud(tmp_path: Path, rows: int) -> None:
         (note,) = load_points(tmp_path / f"{name}.pcd").notes
         assert note.startswith(f"'{name}.pcd': {pose} is not applied")
         assert cloud.unread == ("fpfh", pose, f"grid of {rows // 10} x 10")
+        np.testing.assert_array_equal(cloud.sensor, [1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "viewpoint",
+    ["0 0 0 1 0 0 0", "0 0 0 0.6 0.8 0 0", "nan 0 0 1 0 0 0", "1 2 3", "1 2 3 0 0 0 0", "a b c 1 0 0 0"],
+)
+def test_a_viewpoint_that_says_nothing_of_the_place(tmp_path: Path, viewpoint: str) -> None:
+    (tmp_path / "a.pcd").write_bytes(pcd(9, 9, "ascii").replace(b"0 0 0 1 0 0 0", viewpoint.encode()))
+    assert load_points(tmp_path / "a.pcd").sensor is None
+
+
+def test_the_sensors_place_makes_georeferenced_scans_as_good_as_those_about_the_sensor(
+    tmp_path: Path,
+) -> None:
+    source, target, _ = make_sample_pair()
+    save_points(tmp_path / "source.ply", source.file_points)
+    save_points(tmp_path / "target.ply", target.file_points)
+    for name, shift, scan in (("source", UTM, source), ("target", UTM + 100.0, target)):
+        save_points(tmp_path / f"{name}.pcd", scan.file_points + shift)
+        text = (tmp_path / f"{name}.pcd").read_bytes()
+        place = " ".join(map(repr, shift.tolist()))
+        (tmp_path / f"{name}.pcd").write_bytes(
+            text.replace(b"VIEWPOINT 0 0 0", f"VIEWPOINT {place}".encode())
+        )
+    known = Registrar().explain(tmp_path / "source.ply", tmp_path / "target.ply").result
+    found = Registrar().explain(tmp_path / "source.pcd", tmp_path / "target.pcd")
+    places = [
+        place + scan.origin
+        for place, scan in zip(found.correspondences.viewpoints, (found.source, found.target), strict=True)
+    ]
+    np.testing.assert_array_equal(places, [UTM, UTM + 100.0])
+    T = found.result.T_target_source
+    np.testing.assert_allclose(T[:3, :3], known.T_target_source[:3, :3], atol=0.01)
+    np.testing.assert_allclose(
+        T[:3, :3] @ UTM + T[:3, 3], known.T_target_source[:3, 3] + UTM + 100.0, atol=0.02
+    )
 
 
 def lzf(plain: bytes) -> bytes:

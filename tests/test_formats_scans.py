@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cloud_files import UTM, fails, rigid, small_cloud
 
-from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.io import load_points, save_aligned
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.geometry.se3 import transform_points
 
@@ -65,6 +65,9 @@ def test_ptx_scans_are_placed_by_their_poses(tmp_path: Path) -> None:
     raw = read_raw(tmp_path / "a.ptx")
     assert np.array_equal(raw.fields["intensity"], np.repeat([0.25, 0.0], [50, 30]))
     np.testing.assert_allclose(raw.colors[[0, 79]], [[1, 0, 0.2], [0, 0, 0]])
+    assert cloud.sensor is None  # two of them
+    (tmp_path / "b.ptx").write_text(text[1])
+    np.testing.assert_array_equal(load_points(tmp_path / "b.ptx").sensor, UTM)
     (tmp_path / "b.ptx").write_text(text[0] + ptx(second, T[1], "0.5"))
     assert "colours or intensity of some scans" in read_raw(tmp_path / "b.ptx").unread
     (tmp_path / "a.ptx").write_text(text[0] + "\n".join(text[1].splitlines()[:20]))
@@ -105,13 +108,60 @@ def test_vtk_points_with_their_data(tmp_path: Path, mode: str, version: str) -> 
     out += b"RGB 3 40 unsigned_char\n" + block("u1", colors)
     (tmp_path / "a.vtk").write_bytes(out)
     cloud = read_raw(tmp_path / "a.vtk")
-    assert np.array_equal(cloud.points, points) and cloud.unread == ("vertices",)
+    assert np.array_equal(cloud.points, points) and cloud.unread == () and cloud.faces is None
     np.testing.assert_allclose(cloud.fields["intensity"], values["intensity"], atol=1e-7)
     assert np.array_equal(cloud.fields["ring"], values["ring"])
     assert np.array_equal(cloud.normals, np.tile([0, 0, 1.0], (num, 1)))
     np.testing.assert_allclose(cloud.colors, colors / 255)
     (tmp_path / "a.vtk").write_bytes(out[:700])
     fails(tmp_path / "a.vtk", "says 120 values of POINTS")
+
+
+SQUARE = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n2 0 0\n"  # and a fifth point
+
+
+def vtk(folder: Path, dataset: str, cells: str, version: str = "3.0") -> Path:
+    text = f"# vtk DataFile Version {version}\nx\nASCII\nDATASET {dataset}\nPOINTS 5 float\n{SQUARE}{cells}"
+    (folder / "a.vtk").write_text(text)
+    return folder / "a.vtk"
+
+
+@pytest.mark.parametrize(
+    ("dataset", "cells", "faces", "unread"),
+    [
+        ("POLYDATA", "POLYGONS 2 9\n4 0 1 2 3\n3 1 4 2\n", [[0, 1, 2], [0, 2, 3], [1, 4, 2]], ()),
+        ("POLYDATA", "POLYGONS 2 8\n3 0 1 2\n3 0 2 3\n", [[0, 1, 2], [0, 2, 3]], ()),
+        ("POLYDATA", "TRIANGLE_STRIPS 1 5\n4 0 1 3 2\n", [[0, 1, 3], [3, 1, 2]], ()),
+        ("POLYDATA", "LINES 1 3\n2 0 1\n", None, ("lines",)),
+        ("POLYDATA", "VERTICES 2 4\n1 0\n1 3\n", None, ("vertices",)),
+        (
+            "UNSTRUCTURED_GRID",
+            "CELLS 4 17\n3 0 1 2\n4 0 1 2 4\n4 0 1 2 3\n2 0 1\nCELL_TYPES 4\n5\n10\n9\n3\n",
+            [[0, 1, 2], [0, 1, 2], [0, 2, 3]],
+            ("cells that are no faces",),
+        ),
+        ("STRUCTURED_GRID\nDIMENSIONS 5 1 1", "", None, ("grid of 5 x 1 x 1",)),
+    ],
+)
+def test_flat_cells_of_vtk_are_faces_and_others_are_named(
+    tmp_path: Path, dataset: str, cells: str, faces: list[list[int]] | None, unread: tuple[str, ...]
+) -> None:
+    cloud = read_raw(vtk(tmp_path, dataset, cells))
+    assert cloud.unread == unread
+    assert (cloud.faces is None) if faces is None else (sorted(cloud.faces.tolist()) == sorted(faces))
+    if faces is not None:
+        assert len(load_points(tmp_path / "a.vtk", mesh_points=500)) == 500
+        lost = save_aligned(tmp_path / "a.ply", tmp_path / "a.vtk", rigid())
+        assert lost == unread and np.array_equal(read_raw(tmp_path / "a.ply").faces, cloud.faces)
+
+
+def test_cells_of_vtk_that_do_not_add_up(tmp_path: Path) -> None:
+    offsets = "POLYGONS 3 6\nOFFSETS vtktypeint64\n0 3 6\nCONNECTIVITY vtktypeint64\n0 1 2 0 2 3\n"
+    assert np.array_equal(read_raw(vtk(tmp_path, "POLYDATA", offsets, "5.1")).faces, [[0, 1, 2], [0, 2, 3]])
+    fails(vtk(tmp_path, "POLYDATA", offsets.replace("0 3 6", "0 9 6"), "5.1"), "out of order")
+    fails(vtk(tmp_path, "POLYDATA", "POLYGONS 1 4\n3 0 1 9\n"), "beyond the 5")
+    fails(vtk(tmp_path, "POLYDATA", "POLYGONS 2 8\n3 0 1 2\n7 0 2 3\n"), "do not come to the 8")
+    fails(vtk(tmp_path, "UNSTRUCTURED_GRID", "CELLS 1 4\n3 0 1 2\n"), "0")
 
 
 def test_other_vtk_files(tmp_path: Path) -> None:

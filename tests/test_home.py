@@ -53,7 +53,8 @@ def test_a_user_without_an_account_gets_everything(tmp_path: Path) -> None:
     (kept,) = {path.parent for path in (tmp_path / "tmp").rglob("*.described.npz")}
     said = [line for line in done.stderr.splitlines() if "warning" in line or "atplotlib" in line]
     assert said == [
-        f"warning: this user has no home folder (HOME), so {what} kept in '{folder}'; {variable} can name another folder"
+        f"warning: this user has no home folder (HOME), so {what} kept in '{folder}'; "
+        f"{variable} can name another folder"
         for what, folder, variable in (
             ("descriptions of scans are", kept, "GEOMOE3D_CACHE"),
             ("the list of fonts is", kept.parent / "matplotlib", "MPLCONFIGDIR"),

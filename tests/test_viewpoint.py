@@ -54,6 +54,21 @@ def test_no_sensor_is_believed_where_a_cloud_was_plainly_moved(shift: str) -> No
     assert find_viewpoints(bad, bad, "origin")[0] is not None
 
 
+def test_a_place_that_the_file_gives_is_believed_away_from_the_origin() -> None:
+    points = corner(np.random.default_rng(21), 500)
+    shift = np.array([583394.0, 5283100, 498])
+    near, place = PointCloud(points + 1.0), np.array([1.0, 2.0, 1.5])
+    far = PointCloud(points, origin=shift, sensor=shift + place)
+    for pair, expected in (((far, far), (place, place)), ((near, far), (np.zeros(3), place))):
+        np.testing.assert_array_equal(find_viewpoints(*pair, "auto"), expected)
+    elsewhere = PointCloud(points, origin=shift, sensor=np.array([0.1, 0.0, 0.0]))  # of another frame
+    assert find_viewpoints(far, elsewhere, "auto") == (None, None)
+    at_origin = PointCloud(points + 1.0, sensor=place)
+    np.testing.assert_array_equal(find_viewpoints(at_origin, at_origin, "auto"), np.zeros((2, 3)))
+    for rule in ("guess", "centroid"):
+        assert find_viewpoints(far, far, rule) == (None, None)
+
+
 def test_bare_correspondences_have_their_sensors_at_the_origins_that_are_near() -> None:
     rows, _ = scene()
     zero = np.zeros(3)

@@ -109,8 +109,8 @@ def load_points(
     ``geomoe3d[e57]``), each also behind .gz. Columns of text and of NPY files without names follow
     `formats.raw.split_columns`. The registry (`formats.registry`) takes readers of your own.
 
-    Meshes are sampled evenly over their surface, without normals and colours. The exception is a PLY file
-    with faces and at least 50 000 vertices: that is a dense reconstruction, whose vertices are the cloud.
+    Meshes are sampled evenly over their surface, without normals and colours. The exception is a PLY or VTK
+    file with faces and at least 50 000 vertices: that is a dense reconstruction, whose vertices are the cloud.
 
     The origin follows `recentre.choose_origin`. Normals are brought to length 1; if any is zero or not
     finite all are dropped. Colours are in [0, 1].
@@ -155,6 +155,7 @@ def load_points(
         name=label,
         num_non_finite=num_non_finite,
         notes=tuple(f"'{label}': {note}" for note in raw.notes),
+        sensor=raw.sensor,
     )
 
 
@@ -186,11 +187,11 @@ def describe(data: Any) -> str:
 
 
 def is_sampled(data: Any, raw: RawCloud) -> bool:
-    """Whether a mesh gives sampled surface points (True) or, as a cloud or a dense PLY, its vertices."""
+    """Whether a mesh gives sampled surface points (True) or, as a cloud or a dense PLY or VTK, its vertices."""
     if raw.faces is None:
         return False
-    is_ply = _is_path(data) and Path(data).suffix.lower() == ".ply"
-    return not (is_ply and len(raw.points) >= DENSE_MESH_VERTICES)
+    is_scan = _is_path(data) and Path(str(data).lower().removesuffix(".gz")).suffix in (".ply", ".vtk")
+    return not (is_scan and len(raw.points) >= DENSE_MESH_VERTICES)
 
 
 def read_raw(data: Any) -> RawCloud:
@@ -200,7 +201,7 @@ def read_raw(data: Any) -> RawCloud:
         InputError, FormatError, EmptyCloudError, DependencyError: as `load_points`.
     """
     if isinstance(data, PointCloud):
-        return RawCloud(data.file_points, data.normals, data.colors)
+        return RawCloud(data.file_points, data.normals, data.colors, sensor=data.sensor)
     if not _is_path(data):
         return objects.raw_from_object(data)
     path = Path(data)

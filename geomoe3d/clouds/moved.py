@@ -38,7 +38,8 @@ def moved(data: Any, T: FloatArray) -> Any:
         points = transform_points(T, data.file_points)
         origin, normals = choose_origin(points), data.normals
         turned = None if normals is None else normals @ T[:3, :3].T
-        return replace(data, points=points - origin, origin=origin, normals=turned)
+        sensor = None if data.sensor is None else transform_points(T, data.sensor[None])[0]
+        return replace(data, points=points - origin, origin=origin, normals=turned, sensor=sensor)
     library = library_of(data)
     if library == "torch" and hasattr(data, "detach"):
         return _moved_tensor(data, T)

@@ -23,6 +23,7 @@ from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS, take_inherited
 from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
+from geomoe3d.clouds.vectors import turned
 from geomoe3d.errors import FormatError, InputError, NonFiniteError
 from geomoe3d.runtime.files import check_output, write_atomically
 from geomoe3d.types import FloatArray
@@ -163,11 +164,13 @@ def save_aligned(
     """Write the source at full resolution in the target's file coordinates: p_target = R p_source + t.
 
     All finite points are moved, with their normals (turned), colours and fields, as far as the format holds
-    them; what is lost is returned by name. Where more than one point lies at exactly (0, 0, 0), those mark
-    missing measurements and stay there. A mesh written to PLY, OBJ, OFF, STL or GLB stays a mesh: its
-    triangles are moved. OBJ to OBJ and GLB or GLTF to GLB keep everything else as it is in the file; other
-    meshes written to GLB keep their materials. A mesh written to another suffix becomes the points that
-    `load_points` takes from it.
+    them; what is lost is returned by name. Fields that are directions by their names, such as vx, vy, vz, are
+    turned too (`vectors.turned`); others that depend on the axes are returned by name as kept, not turned. Where
+    more than one point lies at exactly (0, 0, 0), those mark missing measurements and stay there.
+
+    A mesh written to PLY, OBJ, OFF, STL or GLB stays a mesh: its triangles are moved. OBJ to OBJ and GLB or GLTF
+    to GLB keep everything else as it is in the file; other meshes written to GLB keep their materials. A mesh
+    written to another suffix becomes the points that `load_points` takes from it.
 
     Args:
         path: a suffix of `save_points`, or for meshes .obj, .off, .stl or .glb.
@@ -228,7 +231,8 @@ def _save_aligned(
         return tuple(
             n for n in (*lost, *(["normals"] * (raw.normals is not None)), *raw.fields) if n not in kept
         )
-    moved = _moved(raw, T)
+    moved, stayed = _moved(raw, T)
+    lost += [f"{', '.join(stayed)} (kept, not turned)"] * bool(stayed)
     write = (MESH_WRITERS if as_mesh else CLOUD_WRITERS)[suffix]
     if suffix in _WITH_PRECISION:
         single = precision == "single" or (precision == "auto" and fits_single_precision(moved.points))
@@ -254,13 +258,18 @@ _WITH_PRECISION = {  # and who cannot read all digits
 }
 
 
-def _moved(raw: RawCloud, T: FloatArray) -> RawCloud:
-    """Points moved and normals turned; (0, 0, 0) stays where it marks missing measurements."""
+def _moved(raw: RawCloud, T: FloatArray) -> tuple[RawCloud, tuple[str, ...]]:
+    """Points moved, normals and other directions turned; and the fields that would have to be turned and are not.
+
+    (0, 0, 0) stays where it marks missing measurements.
+    """
     points = meshes.move_points(raw.points, T)
     at_zero = ~raw.points.any(axis=1)
     if raw.faces is None and np.count_nonzero(at_zero) > 1:
         points[at_zero] = 0.0
-    return replace(raw, points=points, normals=None if raw.normals is None else raw.normals @ T[:3, :3].T)
+    fields, stayed = turned(raw.fields, T[:3, :3])
+    normals = None if raw.normals is None else raw.normals @ T[:3, :3].T
+    return replace(raw, points=points, normals=normals, fields=fields), stayed
 
 
 def _rigid(T: ArrayLike) -> FloatArray:

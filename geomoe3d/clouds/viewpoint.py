@@ -31,14 +31,16 @@ def find_viewpoints(
     Rule ``auto`` believes that a sensor stood at the file's origin when that lies within one extent of the
     cloud, as it does for depth cameras and single laser scans, and never for georeferenced data, nor where
     the cloud was plainly moved there: its mean, the middle of its box or its lowest corner lies at the
-    origin. ``origin`` always; ``guess`` and ``centroid`` never. Normals of the two clouds must be turned by
-    the same rule, hence both or none.
+    origin. Where it does not, the place is believed that the file itself gives (the pose of its one scan, or
+    VIEWPOINT), within the same limit. ``origin`` always; ``guess`` and ``centroid`` never. Normals of the two
+    clouds must be turned by the same rule, hence both or none.
     """
     if rule in ("guess", "centroid"):
         return None, None
-    if rule == "auto" and not all(_sensor_may_be_at_origin(cloud) for cloud in (source, target)):
-        return None, None
-    return -source.origin, -target.origin
+    if rule == "origin":
+        return -source.origin, -target.origin
+    first, second = _believed(source), _believed(target)
+    return (None, None) if first is None or second is None else (first, second)
 
 
 def known_viewpoints(
@@ -62,10 +64,26 @@ def believed_viewpoints(
     return known_viewpoints(source, target, "auto")
 
 
+def _believed(cloud: PointCloud) -> FloatArray | None:
+    """The local place (3,) of a cloud's sensor by the rule ``auto``, or None."""
+    if _sensor_may_be_at_origin(cloud):
+        return -cloud.origin
+    if cloud.sensor is None:
+        return None
+    place: FloatArray = cloud.sensor - cloud.origin
+    return place if _is_near(place, *bounds(cloud.points)) else None
+
+
+def _is_near(place: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+    """Whether a place lies within one extent of a box."""
+    away = np.linalg.norm(np.maximum(np.maximum(low - place, place - high), 0))
+    return bool(away <= np.linalg.norm(high - low))
+
+
 def _sensor_may_be_at_origin(cloud: PointCloud) -> bool:
     low, high = (corner + cloud.origin for corner in bounds(cloud.points))
     extent = float(np.linalg.norm(high - low))
-    if float(np.linalg.norm(np.maximum(np.maximum(low, -high), 0))) > extent:
+    if not _is_near(np.zeros(3), low, high):
         return False
     mean = cloud.points.mean(axis=0) + cloud.origin
     moved = (mean, _LEAST_MEAN), ((low + high) / 2, _LEAST_MIDDLE), (low, _LEAST_CORNER)

@@ -100,7 +100,9 @@ class FeatureCache:
         except OSError as error:  # OutputError is one
             if not self._complained:
                 self._complained = True
-                warnings.warn(f"features are not kept in '{self.folder}': {error}", RuntimeWarning, stacklevel=2)
+                warnings.warn(
+                    f"features are not kept in '{self.folder}': {error}", RuntimeWarning, stacklevel=2
+                )
         return made
 
     def _shrink(self, keep: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 _IN_MEMORY = "/dev/shm"  # containers with a read-only root still have it
@@ -36,7 +36,7 @@ def _temporary() -> str | None:
     except FileNotFoundError:
         return None
     wanted = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
-    return None if found == os.getcwd() and found not in wanted else found
+    return None if found == str(Path.cwd()) and found not in wanted else found
 
 
 def ensure_font_cache() -> None:
@@ -71,13 +71,15 @@ def folder_for(wanted: Path, name: str, what: str, variable: str) -> Path | None
     own = own_temporary_folder()
     folder = None if own is None else own / name
     if folder is None or _hindrance(folder, made_up=True) is not None:
-        _say(f"{hindrance}, nor a folder for temporary files, so {what} not kept; {variable} can name a folder")
+        _say(
+            f"{hindrance}, nor a folder for temporary files, so {what} not kept; {variable} can name a folder"
+        )
         return None
     _say(f"{hindrance}, so {what} kept in '{folder}'; {variable} can name another folder")
     return folder
 
 
-@lru_cache(maxsize=None)
+@cache
 def _say(sentence: str) -> None:
     warnings.warn(sentence, RuntimeWarning, stacklevel=4)
 

@@ -79,6 +79,7 @@ def read_e57(path: Path) -> RawCloud:
         together("colors", [scan.colors for scan in scans]),
         fields={name: values for name, values in fields.items() if values is not None},
         unread=(*dict.fromkeys(name for scan in scans for name in scan.unread), *unread),
+        sensor=scans[0].sensor if len(scans) == 1 else None,
     )
 
 
@@ -127,7 +128,8 @@ def _read_scan(libe57: Any, file: Any, index: int) -> RawCloud:
         normals = np.stack([data[name] for name in _NORMALS], axis=1) @ rotation.T
         used |= set(_NORMALS)
     fields = {name: values for name, values in data.items() if name not in used and values.any()}
-    cloud = RawCloud(points, normals, colors, fields=fields, unread=tuple(sorted(present - numeric)))
+    unread, sensor = tuple(sorted(present - numeric)), translation if translation.any() else None
+    cloud = RawCloud(points, normals, colors, fields=fields, unread=unread, sensor=sensor)
     return cloud.take(data[state] == 0) if state in data else cloud
 
 

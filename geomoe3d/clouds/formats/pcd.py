@@ -1,7 +1,8 @@
 """PCD: ascii, binary and compressed; SIZE 8 coordinates stay doubles.
 
 All three are read here, with the header's count held against the content; no library of others sees the file.
-A sensor's pose in VIEWPOINT is not applied, as in the Point Cloud Library itself, but named.
+A sensor's pose in VIEWPOINT is not applied to the points, as in the Point Cloud Library itself, but named; its
+place is where the sensor stood.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.clouds.formats.text import parse_numbers, write_rows
 from geomoe3d.clouds.recentre import fits_single_precision
 from geomoe3d.errors import FormatError
+from geomoe3d.types import FloatArray
 
 _KINDS = {
     **{"F4": "f4", "F8": "f8", "I1": "i1", "I2": "i2", "I4": "i4", "I8": "i8"},
@@ -44,6 +46,7 @@ class _Header:
     num_lines: int
     unread: tuple[str, ...]
     notes: tuple[str, ...]
+    sensor: FloatArray | None
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -83,7 +86,7 @@ def read_pcd(path: Path) -> RawCloud:
             chosen.append(columns[k])
     wide = [name for name, count in zip(header.names, header.counts, strict=True) if count != 1]
     unread = (*(name for name in wide if name != "_"), *header.unread)
-    return replace(cloud_of(names, chosen, unread=unread), notes=header.notes)
+    return replace(cloud_of(names, chosen, unread=unread), notes=header.notes, sensor=header.sensor)
 
 
 def _read_header(handle: BinaryIO, path: Path) -> _Header:
@@ -135,13 +138,25 @@ def _read_header(handle: BinaryIO, path: Path) -> _Header:
         raise FormatError(f"'{path}': COUNT names {sum(repeats)} values per point")
     unread: list[str] = []
     notes: tuple[str, ...] = ()
+    sensor: FloatArray | None = None
     if entries.get("VIEWPOINT") and not _is_identity(entries["VIEWPOINT"]):
         unread.append(f"sensor pose (VIEWPOINT {' '.join(entries['VIEWPOINT'])})")
         notes = (f"{unread[0]} is not applied to its points, as in the Point Cloud Library",)
+        sensor = _place(entries["VIEWPOINT"])
     if len(grid) == 2 and grid[1] > 1:
         unread.append(f"grid of {grid[0]} x {grid[1]}")
     stored = [_KINDS[kind] for kind in kinds]
-    return _Header(names, stored, repeats, num_points, data, num_lines, tuple(unread), notes)
+    return _Header(names, stored, repeats, num_points, data, num_lines, tuple(unread), notes, sensor)
+
+
+def _place(viewpoint: list[str]) -> FloatArray | None:
+    """The place (3,) of the sensor where the header gives one other than the origin, which is the default."""
+    try:
+        values = np.array([float(value) for value in viewpoint])
+    except ValueError:
+        return None
+    sound = len(values) == 7 and np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < 1e-3
+    return values[:3] if sound and values[:3].any() else None
 
 
 def _is_identity(viewpoint: list[str]) -> bool:

@@ -309,7 +309,13 @@ def write_ply(handle: BinaryIO, cloud: RawCloud, single: bool = False, note: str
     if cloud.colors is not None:
         rows += [(color, "u1") for color in ("red", "green", "blue")]
     kept, lost = storable_fields(cloud, _WRITTEN, {name for name, _ in rows})
-    rows += [(name, values.dtype.str[1:]) for name, values in kept.items()]
+    held = {"flags": "i4"} | ({"intensity": "f4"} if cloud.colors is not None else {})
+    for (
+        name,
+        values,
+    ) in kept.items():  # MeshLab hides points by flags, and paints intensity over colours: no doubles
+        kind = values.dtype.str[1:]
+        rows.append((name, "f8" if held.get(name) == kind else kind))
     header = ["ply", "format binary_little_endian 1.0", "comment written by geomoe3d"]
     header += [f"comment {note}"] * bool(note)
     header.append(f"element vertex {len(cloud.points)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ def read_ptx(path: Path) -> RawCloud:
         FormatError: a line that does not parse, or a scan of fewer points than its grid has places.
     """
     tables: list[FloatArray] = []
+    places: list[FloatArray] = []
     grids: list[str] = []
     with path.open(encoding="utf-8-sig", errors="replace") as handle:
         lines = DataLines(handle)
@@ -38,6 +40,7 @@ def read_ptx(path: Path) -> RawCloud:
             columns = header_count(first, path, "number of columns")
             num_points = columns * header_count(next(lines, ""), path, "number of rows")
             T = _pose(path, lines)
+            places.append(T[:3, 3])
             grids.append(f"grid of {columns} x {num_points // max(columns, 1)}")
             lines.begin(num_points)
             table = _scan(path, lines, num_points)
@@ -52,7 +55,8 @@ def read_ptx(path: Path) -> RawCloud:
     whole = np.concatenate([table[:, :width] for table in tables])
     lost = "colours or intensity of some scans"
     some = any(table.shape[1] != width for table in tables)
-    return cloud_of(_NAMES[width], list(whole.T), unread=(*grids, lost) if some else tuple(grids))
+    cloud = cloud_of(_NAMES[width], list(whole.T), unread=(*grids, lost) if some else tuple(grids))
+    return replace(cloud, sensor=places[0] if len(places) == 1 and places[0].any() else None)
 
 
 def _pose(path: Path, lines: DataLines) -> FloatArray:

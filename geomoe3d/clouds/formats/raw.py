@@ -47,6 +47,7 @@ class RawCloud:
             the type of the file.
         unread: names of what else the file says and nothing here holds.
         notes: sentences on what was not taken as it stands, which its user should know.
+        sensor: (3,) where the file says that the one sensor stood, or None.
     """
 
     points: FloatArray
@@ -56,6 +57,7 @@ class RawCloud:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    sensor: FloatArray | None = None
 
     def take(self, rows: NDArray[np.bool_]) -> RawCloud:
         """The points of a mask with all that belongs to them; faces are given up."""
@@ -66,6 +68,7 @@ class RawCloud:
             fields={name: values[rows] for name, values in self.fields.items()},
             unread=self.unread,
             notes=self.notes,
+            sensor=self.sensor,
         )
 
 

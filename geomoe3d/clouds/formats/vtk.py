@@ -1,4 +1,8 @@
-"""VTK's legacy files (.vtk), ascii and binary: the points of any dataset, with what is said of them."""
+"""VTK's legacy files (.vtk), ascii and binary: the points of any dataset with what is said of them, and faces.
+
+Polygons, strips of triangles, and the flat cells of an unstructured grid are triangles. Solid cells and lines are
+named as lost; so are vertices, unless they only say that every point is to be seen.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from numpy.typing import NDArray
 from geomoe3d.clouds.formats.raw import RawCloud, cloud_of, header_count, wrong_count
 from geomoe3d.clouds.formats.registry import reader
 from geomoe3d.errors import FormatError
+from geomoe3d.types import IntArray
 
 _TYPES = {
     **{"float": "f4", "double": "f8", "char": "i1", "unsigned_char": "u1", "short": "i2"},
@@ -19,6 +24,9 @@ _TYPES = {
     **{"vtktypeint64": "i8", "vtkidtype": "i8"},
 }
 _CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS")
+_STRIP = 6  # of the numbers of cells' types, as are the following
+_FLAT_CELLS = {5: "triangle", 6: "strip", 7: "polygon", 9: "quadrilateral"}
+_POINT_CELLS = (1, 2)
 
 
 class _Body:
@@ -69,7 +77,7 @@ class _Body:
 
 @reader(".vtk")
 def read_vtk(path: Path) -> RawCloud:
-    """POINTS of a legacy file, with normals, colours and scalars of POINT_DATA; cells are passed over.
+    """POINTS of a legacy file, with normals, colours, vectors and scalars of POINT_DATA, and its triangles.
 
     Raises:
         FormatError: no legacy VTK file, no points, or fewer values than it says.
@@ -88,14 +96,15 @@ def read_vtk(path: Path) -> RawCloud:
     points: NDArray[Any] | None = None
     names, columns = ["x", "y", "z"], []
     unread: list[str] = []
+    cells: dict[str, _Lists] = {}
+    kinds = np.zeros(0, np.int64)
     while words := body.line():
         key = words[0].upper()
         if key == "POINTS" and len(words) >= 3:
             num = header_count(words[1], path, "number of points")
             points = body.numbers(words[2], 3 * num, "POINTS").reshape(-1, 3)
         elif key in _CELLS and len(words) >= 3:
-            unread.append(key.lower())
-            _skip_cells(body, words)
+            cells[key] = _read_cells(body, words)
         elif key == "POINT_DATA" and points is not None and len(words) > 1:
             if header_count(words[1], path, "number of point data") != len(points):
                 raise wrong_count(path, int(words[1]), len(points), "points with data")
@@ -107,25 +116,85 @@ def read_vtk(path: Path) -> RawCloud:
             if key == "CELL_DATA":
                 break
             if key == "CELL_TYPES":
-                body.numbers("int", header_count(words[1], path, "number of cells"), key)
-        elif key not in ("DATASET", "DIMENSIONS", "INFORMATION", "NAME", "DATA", "FIELD"):
+                kinds = body.numbers("int", header_count(words[1], path, "number of cells"), key).astype(
+                    np.int64
+                )
+        elif key == "DIMENSIONS":
+            unread.append(f"grid of {' x '.join(words[1:])}"[:60])
+        elif key not in ("DATASET", "INFORMATION", "NAME", "DATA", "FIELD"):
             unread.append(f"what follows {words[0][:40]}")
             break
     if points is None:
         raise FormatError(f"'{path}' has no POINTS; other datasets of VTK are grids of values, no clouds")
-    return cloud_of(names, [*points.T, *columns], unread=tuple(unread))
+    faces, others = _faces(path, cells, kinds, len(points))
+    return cloud_of(names, [*points.T, *columns], faces=faces, unread=(*others, *unread))
 
 
-def _skip_cells(body: _Body, words: list[str]) -> None:
+_Lists = tuple[IntArray, IntArray]  # where each cell's points begin, and the points of all
+
+
+def _read_cells(body: _Body, words: list[str]) -> _Lists:
     first, second = (header_count(word, body.path, words[0]) for word in words[1:3])
     place = body._place
     if (after := body.line())[:1] == ["OFFSETS"]:  # version 5
-        body.numbers(after[1], first, "OFFSETS")
+        begins = body.numbers([*after, ""][1], first, "OFFSETS").astype(np.int64)
         after = body.line()
-        body.numbers(after[-1], second, "CONNECTIVITY")
-    else:
-        body._place = place
-        body.numbers("int", second, words[0])
+        return begins, body.numbers((after or [""])[-1], second, "CONNECTIVITY").astype(np.int64)
+    body._place = place
+    table = body.numbers("int", second, words[0]).astype(np.int64)
+    width = second // max(first, 1)
+    if first and width > 0 and second == first * width and (table[::width] == width - 1).all():
+        return np.arange(first + 1) * (width - 1), table.reshape(first, width)[:, 1:].ravel()
+    places, points, at = [0], [], 0
+    for _ in range(first):
+        length = int(table[at]) if at < second else -1
+        if not 0 <= length < second - at:
+            raise FormatError(
+                f"'{body.path}': the lengths of {words[0]} do not come to the {second} that it says"
+            )
+        points.append(table[at + 1 : at + 1 + length])
+        places.append(places[-1] + length)
+        at += 1 + length
+    return np.array(places), np.concatenate(points) if points else np.zeros(0, np.int64)
+
+
+def _faces(
+    path: Path, cells: dict[str, _Lists], kinds: IntArray, num_points: int
+) -> tuple[IntArray | None, list[str]]:
+    """Triangles (M, 3) of all flat cells, or None, and names of the other cells.
+
+    Raises:
+        FormatError: a cell names a point that there is not, or the cells are more or fewer than their types.
+    """
+    found: list[IntArray] = []
+    others: list[str] = []
+    for key, (begins, points) in cells.items():
+        if len(points) and (points.min() < 0 or points.max() >= num_points):
+            raise FormatError(f"'{path}': {key} name points beyond the {num_points} that the file holds")
+        if (np.diff(begins) < 0).any() or (len(begins) and not 0 <= begins[0] <= begins[-1] <= len(points)):
+            raise FormatError(f"'{path}': the offsets of {key} are out of order")
+        of = {"POLYGONS": 7, "TRIANGLE_STRIPS": _STRIP, "VERTICES": 1}.get(key, 0)
+        num_cells = max(len(begins) - 1, 0)
+        types = kinds if key == "CELLS" else np.full(num_cells, of)
+        if len(types) != num_cells:
+            raise wrong_count(path, num_cells, len(types), "types of cells")
+        lengths = np.diff(begins)
+        for kind, length in np.unique(np.stack([types, lengths]), axis=1).T.tolist() if num_cells else ():
+            if kind not in _FLAT_CELLS or length < 3:
+                continue
+            rows = begins[:-1][(types == kind) & (lengths == length)]
+            first = np.arange(length - 2)
+            odd = first % 2  # every second triangle of a strip runs the other way round
+            strip = (first + odd, first + 1 - odd, first + 2)
+            corners = strip if kind == _STRIP else (0 * first, first + 1, first + 2)
+            found.append(points[(rows[:, None, None] + np.stack(corners, axis=1)).reshape(-1, 3)])
+        plain = np.isin(types, _POINT_CELLS)
+        rest = ~np.isin(types, (*_FLAT_CELLS, *_POINT_CELLS))
+        if rest.any():
+            others.append("lines" if key == "LINES" else "cells that are no faces")
+        if plain.any() and len(np.unique(points[np.repeat(plain, lengths)])) < num_points and not found:
+            others.append("vertices")
+    return (np.concatenate(found) if found else None), others
 
 
 def _attributes(body: _Body, count: int, unread: list[str]) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -139,7 +208,8 @@ def _attributes(body: _Body, count: int, unread: list[str]) -> Iterator[tuple[st
         elif key == "NORMALS" and len(words) >= 3:
             yield from _named("normals", body.numbers(words[2], count * 3, key), 3, ("nx", "ny", "nz"))
         elif key == "VECTORS" and len(words) >= 3:
-            yield from _named(words[1], body.numbers(words[2], count * 3, key), 3)
+            axes = tuple(f"{words[1]}_{axis}" for axis in "xyz")
+            yield from _named(words[1], body.numbers(words[2], count * 3, key), 3, axes)
         elif key == "COLOR_SCALARS" and len(words) >= 3:
             width = header_count(words[2], body.path, key)
             kind = "unsigned_char" if not body._ascii else "float"

@@ -28,6 +28,14 @@ from typing import Any
 
 LONGEST_SECONDS = 10.0
 MEMORY_FACTOR, MEMORY_SLACK = 10, 96 << 20  # of the file's size, and bytes besides for libraries
+CELLS = {
+    version: f"# vtk DataFile Version {version}\nx\nASCII\nDATASET POLYDATA\nPOINTS 4 float\n0 0 0 1 0 0 1 1 0 0 1 0\n"
+    + cells
+    for version, cells in (
+        ("3.0", "POLYGONS 2 9\n4 0 1 2 3\n3 0 1 2\nTRIANGLE_STRIPS 1 5\n4 0 1 3 2\nLINES 1 3\n2 0 1\n"),
+        ("5.1", "POLYGONS 3 7\nOFFSETS vtktypeint64\n0 4 7\nCONNECTIVITY vtktypeint64\n0 1 2 3 0 1 2\n"),
+    )
+}
 NUMBERS = (b"0", b"-1", b"1", b"255", b"65536", b"2147483648", b"99999999999", b"1e999", b"nan", b"0.5", b"")
 
 
@@ -121,6 +129,13 @@ def make_samples() -> dict[str, bytes]:
             (folder / f"{mode}.pcd").write_bytes(cloud_files.pcd(60, 60, mode))
         (folder / "ascii.ply").write_bytes(cloud_files.ply(60, 60))
         io.save_aligned(folder / "mesh.ply", folder / "a.obj", np.eye(4))
+        trimesh: Any = importlib.import_module("trimesh")
+        exported = trimesh.exchange.gltf.export_gltf(
+            trimesh.Scene(trimesh.creation.box()), embed_buffers=True
+        )
+        (folder / "embedded.gltf").write_bytes(exported["model.gltf"])
+        for version in ("3.0", "5.1"):
+            (folder / f"cells-{version}.vtk").write_text(CELLS[version])
         for kind in transforms.TRANSFORM_FORMATS:
             if kind != "json":
                 transforms.save_transform(

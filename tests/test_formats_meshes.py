@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cloud_files import UTM, assert_on_box, fails, rigid
 
-from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.io import load_points, save_aligned
+from geomoe3d.clouds.loading import read_raw
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.geometry.se3 import transform_points
 
@@ -108,3 +110,37 @@ def test_stl_with_bytes_behind_its_faces(tmp_path: Path) -> None:
     solid = b"solid" + (tmp_path / "a.stl").read_bytes()[5:]  # binary all the same
     (tmp_path / "a.stl").write_bytes(solid[: 84 + 12 * 50])
     assert_on_box(load_points(tmp_path / "a.stl", mesh_points=400).points, 400)
+
+
+CORNERS = ("0 0 0", "1 0 0", "0 1 0")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "unread"),
+    [
+        ("a.off", "OFF\n3 1 0\n{0}\n{1}\n{2}\n3 0 1 2\n", ()),
+        ("a.off", "COFF\n3 1 0\n{0} 9 9 9 9\n{1} 9 9 9 9\n{2} 9 9 9 9\n3 0 1 2\n", ("colors",)),
+        ("a.off", "NOFF\n3 1 0\n{0} 0 0 1\n{1} 0 0 1\n{2} 0 0 1\n3 0 1 2\n", ("normals",)),
+        ("a.off", "OFF\n3 1 0\n{0}\n{1}\n{2}\n3 0 1 2 255 0 0\n", ("face colors",)),
+        ("a.obj", "v {0} 1 0 0\nv {1} 1 0 0\nv {2} 1 0 0\nf 1 2 3\n", ()),  # which are read
+        (
+            "a.obj",
+            "v {0} 1 0 0\nv {1} 1 0 0\nv {2} 1 0 0\nvt 0 0\nf 1/1 2/1 3/1\n",
+            ("texture coordinates", "colors", "materials"),
+        ),
+    ],
+)
+def test_what_a_mesh_says_and_is_not_read_is_named(
+    tmp_path: Path, name: str, text: str, unread: tuple[str, ...]
+) -> None:
+    (tmp_path / name).write_text(text.format(*CORNERS))
+    found = read_raw(tmp_path / name)
+    assert found.unread == unread and len(found.points) == 3
+    assert save_aligned(tmp_path / "b.stl", tmp_path / name, np.eye(4))[: len(unread)] == unread
+
+
+@pytest.mark.parametrize(("attribute", "unread"), [(0, ()), (0x801F, ("face attributes",))])
+def test_attributes_of_stl_faces_are_named(tmp_path: Path, attribute: int, unread: tuple[str, ...]) -> None:
+    face = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, attribute)
+    (tmp_path / "a.stl").write_bytes(bytes(80) + struct.pack("<I", 1) + face)
+    assert read_raw(tmp_path / "a.stl").unread == unread

@@ -132,3 +132,12 @@ def test_gzip_of_any_format(tmp_path: Path, suffix: str) -> None:
     fails(packed, "no gzip file or damaged")
     packed.write_bytes(gzip.compress(b"1 2 3\n" * 4_000_000))
     fails(packed, "200 times")
+
+
+def test_names_in_quotes_are_names(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        '"intensity","Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2"\n9,1,2,3\n8,4,5,6\n'
+    )
+    cloud = read_raw(tmp_path / "a.csv")
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+    assert list(cloud.fields) == ["intensity"]

@@ -95,7 +95,7 @@ def test_missing_file_and_directory(tmp_path: Path) -> None:
     fails(tmp_path / "folder.ply", "is a directory", error=InputError)
 
 
-@pytest.mark.parametrize(("name", "nearest"), [("a.plly", ".ply"), ("a.lasz", ".laz"), ("a.npzz", ".npz")])
+@pytest.mark.parametrize(("name", "nearest"), [("a.plly", ".ply"), ("a.lza", ".laz"), ("a.npzz", ".npz")])
 def test_unknown_suffix_names_the_nearest(tmp_path: Path, name: str, nearest: str) -> None:
     (tmp_path / name).write_text("1 2 3")
     fails(tmp_path / name, f"did you mean {nearest}?", *READABLE_SUFFIXES)
@@ -109,7 +109,20 @@ def test_other_suffixes_list_all(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "meant"),
-    [("a.zip", "unpack"), ("a.rcp", "E57"), ("a.pcap", "recording"), ("a.fbx", "OBJ"), ("a.pkl", "pickled")],
+    [
+        ("a.zip", "unpack"),
+        ("a.rcp", "E57"),
+        ("a.pcap", "recording"),
+        ("a.fbx", "OBJ"),
+        ("a.pkl", "pickled"),
+        ("a.dat", "rename it to .txt"),
+        ("a.xyzrgb", "rename it to .txt"),
+        ("a.xlsx", "CSV"),
+        ("a.copc", "end with .laz"),
+        ("a.splat", "PLY"),
+        ("a.doc", "document"),
+        ("a.PCL", "save it as .pcd"),
+    ],
 )
 def test_unknown_suffixes_by_what_they_are(tmp_path: Path, name: str, meant: str) -> None:
     (tmp_path / name).write_text("1 2 3")

@@ -227,6 +227,7 @@ def test_output_places_that_do_not_work(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / "none" / "a.ply", OutputError, "does not exist"),
         (tmp_path / "folder.ply", OutputError, "it is a folder"),
         (tmp_path / "a.plyy", FormatError, "did you mean .ply?"),
+        (tmp_path / "a.pts", FormatError, ".pts is read here, but not written"),
         (tmp_path / "a.e58", FormatError, ", ".join(WRITABLE_SUFFIXES)),
         (tmp_path / "a", FormatError, "no suffix"),
     ):
@@ -308,4 +309,4 @@ def test_a_moved_obj_keeps_its_texture(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.vertices, transform_points(rigid(), corners), atol=1e-12)
     assert found.visual.material.image.convert("RGB").getpixel((0, 0)) == (10, 200, 30)
     lost = save_aligned(tmp_path / "c.ply", tmp_path / "in" / "a.obj", rigid())
-    assert lost == ("texture coordinates", "normals", "materials")
+    assert lost == ("texture coordinates", "normals", "materials", "colors")

@@ -32,6 +32,7 @@ from geomoe3d.clouds.formats import (  # noqa: F401  each registers its readers 
     text,
     vtk,
 )
+from geomoe3d.clouds.formats.others import MEANT
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import READERS, take_inherited
 from geomoe3d.clouds.recentre import choose_origin
@@ -51,52 +52,6 @@ MAX_COORDINATE = 1e12
 DENSE_MESH_VERTICES = 50_000
 
 READABLE_SUFFIXES = tuple(READERS)
-_MEANT = {  # what files of other kinds are, and what helps
-    "an archive; unpack it first": (".zip", ".7z", ".rar", ".tar", ".tgz", ".bz2", ".xz", ".zst"),
-    "a scanner maker's project; export it as E57, PTX or LAS": (
-        *(".rcp", ".rcs", ".fls", ".lsproj", ".zfs", ".fws", ".rdbx", ".rxp", ".imp", ".cl3", ".dp", ".tzf"),
-    ),
-    "a recording of a sensor; export single sweeps as PCD or PLY": (".pcap", ".bag", ".db3", ".mcap", ".osf"),
-    "VTK's XML; save it as legacy .vtk or as PLY": (".vtp", ".vtu", ".vti", ".vts", ".vtr", ".vtm"),
-    "a model of another program; export it as OBJ, PLY or GLB": (
-        *(
-            ".dae",
-            ".fbx",
-            ".3ds",
-            ".blend",
-            ".usd",
-            ".usdz",
-            ".usda",
-            ".usdc",
-            ".wrl",
-            ".x3d",
-            ".3mf",
-            ".step",
-        ),
-        *(".stp", ".iges", ".igs", ".ifc", ".dwg", ".dxf", ".skp", ".max", ".rvt"),
-    ),
-    "an image or a raster; turn it into points first": (
-        ".png",
-        ".jpg",
-        ".jpeg",
-        ".tif",
-        ".tiff",
-        ".exr",
-        ".dem",
-    ),
-    "pickled Python, which can run anything and is not read; save an array as .npy": (
-        *(".pkl", ".pickle", ".pth", ".pt"),
-    ),
-    "a container of arrays; save the points as .npy": (
-        ".h5",
-        ".hdf5",
-        ".mat",
-        ".parquet",
-        ".feather",
-        ".zarr",
-    ),
-    "a transform or settings; clouds come first": (".json", ".yaml", ".yml", ".tum", ".kitti"),
-}
 
 
 def load_points(
@@ -273,15 +228,22 @@ def _is_path(data: Any) -> bool:
 
 
 def unknown_suffix(path: Path, known: tuple[str, ...], verb: str) -> str:
-    """A message that names the nearest known suffix and all of them."""
+    """A message that says what such a file is, or names a suffix of nearly the same letters, and all that are known."""
     suffix = path.suffix.lower()
     listed = f"{verb}: {', '.join(known)}"
     if not suffix:
         return f"'{path}' has no suffix to tell its format; {listed}"
-    meant = next((what for what, suffixes in _MEANT.items() if suffix in suffixes), None)
+    meant = next((what for what, suffixes in MEANT.items() if suffix in suffixes), None)
+    if verb == "writable" and suffix in READERS:
+        return f"'{path}': {suffix} is read here, but not written; {listed}"
     if meant is not None and verb == "readable":
         return f"'{path}' is {meant}; {listed}"
-    close = difflib.get_close_matches(suffix, known, n=1, cutoff=0.5)
+    close = [
+        one
+        for one in known
+        if sorted(one) == sorted(suffix) or suffix.startswith(one) or one.startswith(suffix)
+    ]
+    close = close or difflib.get_close_matches(suffix, known, n=1, cutoff=0.86)
     nearest = f"did you mean {close[0]}? " if close else ""
     return f"'{path}' has the unknown suffix '{path.suffix}'; {nearest}{listed}"
 

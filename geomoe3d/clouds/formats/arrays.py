@@ -154,7 +154,7 @@ def table_cloud(
     table: FloatArray = np.array(array, dtype=np.float64, order="C")
     if array.shape[1] == 3:
         return RawCloud(table, unread=grid)
-    cloud = split_columns(table, None, what)
+    cloud = split_columns(table, None, what, "as fields of a structured array: id, x, y, z")
     return replace(cloud, fields={name: column.astype(array.dtype) for name, column in cloud.fields.items()})
 
 

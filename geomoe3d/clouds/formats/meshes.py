@@ -13,6 +13,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -63,7 +64,14 @@ def _as_format_errors(path: Path) -> Iterator[None]:
         log.setLevel(level)
 
 
-_OBJ_WORDS = {"vt": "texture coordinates", "vn": "normals", "usemtl": "materials", "l": "lines"}
+_OBJ_WORDS = {
+    "vt": "texture coordinates",
+    "vn": "normals",
+    "usemtl": "materials",
+    "l": "lines",
+    "colors": "colors",
+}
+_OFF_LETTERS = {"ST": "texture coordinates", "C": "colors", "N": "normals"}
 
 
 @reader(".obj", ".stl", ".off")
@@ -77,12 +85,42 @@ def read_mesh(path: Path) -> RawCloud:
     scene = load_scene(path)
     with _as_format_errors(path):
         mesh = flatten(scene, f"'{path}'")
-    if path.suffix.lower() != ".obj":
-        return mesh
+        said = {".obj": _said_by_obj, ".off": _said_by_off, ".stl": _said_by_stl}[path.suffix.lower()](path)
+    held = ("colors",) if mesh.colors is not None else ()
+    return replace(
+        mesh, unread=tuple(dict.fromkeys(name for name in (*said, *mesh.unread) if name not in held))
+    )
+
+
+def _said_by_obj(path: Path) -> list[str]:
+    """What an OBJ says beside positions and faces."""
     with path.open(encoding="latin-1") as handle:
-        words = {line.split(None, 1)[0] for line in handle if line.strip()}
-    said = [name for word, name in _OBJ_WORDS.items() if word in words]
-    return replace(mesh, unread=tuple(dict.fromkeys((*said, *mesh.unread))))
+        rows = (line.split(None, 7) for line in handle if line.strip())
+        words = {"colors" if row[0] == "v" and len(row) >= 7 else row[0] for row in rows}
+    return [name for word, name in _OBJ_WORDS.items() if word in words]
+
+
+def _said_by_off(path: Path) -> list[str]:
+    """What an OFF says beside positions and faces: by the letters of its first line, and behind its faces."""
+    with path.open(encoding="latin-1") as handle:
+        rows = (line.partition("#")[0].split() for line in handle)
+        rows = (row for row in rows if row)
+        first = next(rows)
+        counts = first[1:] if len(first) > 1 else next(rows)
+        faces = islice(rows, int(counts[0]), int(counts[0]) + int(counts[1]))
+        painted = any(len(row) > 1 + int(float(row[0])) for row in faces)
+    kind = first[0].upper().removesuffix("OFF")
+    said = [name for letters, name in _OFF_LETTERS.items() if letters in kind]
+    return [*said, *(["face colors"] if painted else [])]
+
+
+def _said_by_stl(path: Path) -> list[str]:
+    """What a binary STL says of its faces beside their corners."""
+    size = _stl_size(path)
+    if size is None:
+        return []
+    rows = np.frombuffer(path.read_bytes()[84:size], np.uint8).reshape(-1, 50)
+    return ["face attributes"] if rows[:, 48:].any() else []
 
 
 def _stl_size(path: Path) -> int | None:
@@ -153,10 +191,12 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
     if not sum(len(part.points) for part in parts):
         raise EmptyCloudError(f"{what} holds 0 points: no mesh and no point cloud")
     if any(_num_faces(part) for part in parts):
+        unread += ["points without faces"] if not all(_num_faces(part) for part in parts) else []
         parts = [part for part in parts if _num_faces(part)]
     starts = np.cumsum([0] + [len(part.points) for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     colors = [part.colors for part in parts if part.colors is not None]
+    unread += ["colors of some parts"] if 0 < len(colors) < len(parts) else []
     return RawCloud(
         np.concatenate([part.points for part in parts]),
         colors=np.concatenate(colors) if len(colors) == len(parts) else None,

@@ -112,6 +112,7 @@ def cloud_of(
     if "colors" in groups and colors is None:
         del groups["colors"]
     used = {k for chosen in groups.values() for k in chosen}
+    names = [name.strip().strip("\"'") for name in names]
     fields: dict[str, NDArray[Any]] = {}
     for k, (name, column) in enumerate(zip(names, columns, strict=True)):
         if k not in used and name in fields:
@@ -136,12 +137,23 @@ def _side_by_side(columns: Sequence[NDArray[Any]], kind: Any) -> NDArray[Any]:
     return table
 
 
-def split_columns(table: FloatArray, names: Sequence[str] | None, what: str) -> RawCloud:
+def split_columns(
+    table: FloatArray,
+    names: Sequence[str] | None,
+    what: str,
+    naming: str = "in a first line such as 'id x y z'",
+) -> RawCloud:
     """Columns of a text table or an array file, by name or, without names, by this rule.
 
     The first three are x, y, z. Of exactly six (or nine) columns, the first further triple of which at least
     99 % of the rows are of length 1 within 0.01 is taken as normals, unless it holds only zeros and ones.
     All others are fields: values that could be colours could as well be intensity, ring and time.
+
+    Args:
+        table: (N, C) numbers.
+        names: of the columns, or None.
+        what: the file, in messages.
+        naming: how its columns can be named, in messages.
 
     Raises:
         FormatError: no names, and the first column counts the rows like a point number.
@@ -150,8 +162,8 @@ def split_columns(table: FloatArray, names: Sequence[str] | None, what: str) -> 
         if _counts_rows(table):
             raise FormatError(
                 f"{what}: the first column rises in whole numbers from {table[0, 0]:.0f} to "
-                f"{table[-1, 0]:.0f}, as point numbers do, and nothing says what it is; name the columns in "
-                "a first line such as 'id x y z' (or 'x y z ...', if it is x), or remove it"
+                f"{table[-1, 0]:.0f}, as point numbers do, and nothing says what it is; name the columns "
+                f"{naming} (or 'x y z ...', if it is x), or remove it"
             )
         names = ["x", "y", "z", *(f"column_{k}" for k in range(4, table.shape[1] + 1))]
         for first in range(3, table.shape[1], 3) if table.shape[1] in (6, 9) else ():

@@ -26,6 +26,7 @@ from geomoe3d.clouds.prepare import (
 from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, between_clouds
+from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
@@ -182,6 +183,10 @@ class Registrar:
         clock("decide")
         if decision.answer is not None:
             decision = decision.with_scale(measure_scale(decision.T_target_source, *pair.clouds))
+            told = measure_accuracy(
+                decision.T_target_source, *pair.clouds, pair.matched, pair.inlier_threshold
+            )
+            decision = replace(decision, accuracy=told)
         if decision.judgement.status != "ok" and (units := self._units(clouds, clock)) is not None:
             decision = decision.with_note(units, first=True)
         read = (source, target), pair.clouds, wanted, places is not None

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from geomoe3d.geometry.se3 import make_transform, rotation_angle_deg, transform_points
 from geomoe3d.result import Alternative
 from geomoe3d.visual.drawing import build_drawing, distance_to_target
-from geomoe3d.visual.page import render_page, save_page
+from geomoe3d.visual.page import distance_limit, render_page, save_page
 from geomoe3d.visual.view import RegistrationView
 
 # ---------------------------------------------------------------- the page as a file
@@ -87,6 +87,17 @@ def test_page_keeps_user_text_as_text_and_asks_no_network():
     assert len(labels) == sum("id" in a for _, a in page.elements)  # ids are unique
 
 
+def test_the_colour_scale_ends_where_the_data_do():
+    rng = np.random.default_rng(0)
+    fit, rim = (
+        np.abs(rng.normal(0, 0.01, 9000)),
+        rng.uniform(0, 0.4, 1000),
+    )  # what lies on it, and beside its end
+    limit = distance_limit(np.concatenate([fit, rim, [np.inf]]), 0.4)
+    assert 0.03 < limit < 0.06
+    assert distance_limit(np.full(3, np.inf), 0.4) == distance_limit(np.zeros(3), 0.4) == 0.4
+
+
 def test_page_data_are_the_clouds_and_the_answer():
     view = nasty_view()
     data = Page(render_page(view)).data()
@@ -107,12 +118,14 @@ def test_page_data_are_the_clouds_and_the_answer():
     ):
         copied = np.array([[float(v) for v in line.split()] for line in data["matrices"][name].splitlines()])
         np.testing.assert_array_equal(copied, T)  # every bit
-    assert data["distanceLimit"] == 2 * view.result.inlier_threshold
+    reach, limit = data["distanceReach"], data["distanceLimit"]
+    assert reach == 2 * view.result.inlier_threshold
+    assert 0 < limit <= reach
     for name, motion in (("answer", scene.after), ("alternative", scene.alternative)):
-        distance = distance_to_target(view, scene, motion, data["distanceLimit"])
+        distance = distance_to_target(view, scene, motion, reach)
         levels = decode(data["distances"][name], "u1")
         np.testing.assert_allclose(
-            levels, np.minimum(255 * distance / data["distanceLimit"], 255), atol=0.501
+            levels, np.where(distance < reach, np.minimum(254 * distance / limit, 254), 255), atol=0.501
         )
         assert len(np.unique(levels)) > 50
     lines = decode(data["lines"]["vertices"], "<f4").reshape(-1, 2, 3)
@@ -162,6 +175,7 @@ USE = r"""
   byId("show-source").click();
   byId("classes").querySelector("input").click(); await note("lines");
   document.querySelector('[name="color"][value="distance"]').click();
+  log.bars = byId("histogram").querySelectorAll("i").length; log.near = byId("beyond").textContent;
   document.querySelector('[name="motion"][value="alternative"]').click();
   await note("alternative");
   key(" "); await note("playing"); key(" ");
@@ -216,6 +230,7 @@ def test_page_in_a_browser(tmp_path, webgl):
     start, turned, moved = camera(log["at1"]), camera(log["turned"]), camera(log["moved"])
     assert turned[yaw] != start[yaw] and np.array_equal(turned[1:], start[1:])
     assert np.array_equal(moved[:3], turned[:3]) and not np.array_equal(moved[3:], turned[3:])
+    assert log["bars"] == 51 and "have a target point within" in log["near"]
     assert camera(log["zoomed"])[distance] == pytest.approx(0.87 * moved[distance], rel=1e-4)
     top = camera(log["top"])
     assert top[pitch] == pytest.approx(np.pi / 2, rel=1e-5)

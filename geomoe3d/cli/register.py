@@ -27,6 +27,7 @@ class _Outputs:
     transforms: tuple[str, ...]
     aligned: str | None
     precision: str
+    distances: bool
     picture: str | None
     page: str | None
 
@@ -54,6 +55,11 @@ class _Outputs:
     default="auto",
     help="Coordinates of PLY and PCD: auto, double, or single (floats about an origin). [auto]",
 )
+@click.option(
+    "--distances",
+    is_flag=True,
+    help="With --aligned: write each point's distance to the nearest point of TARGET as a field 'distance'.",
+)
 @part_option("reader")
 @part_option("writer")
 @click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
@@ -80,6 +86,7 @@ def command(
     output: tuple[str, ...],
     aligned: str | None,
     aligned_precision: str,
+    distances: bool,
     picture: str | None,
     page: str | None,
     show: bool,
@@ -93,7 +100,7 @@ def command(
     low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
     """
 
-    outputs = _Outputs(output, aligned, aligned_precision, picture, page)
+    outputs = _Outputs(output, aligned, aligned_precision, distances, picture, page)
     _check_outputs(outputs, (source, target), force)
     if show:
         from geomoe3d.visual.window import check_display
@@ -121,7 +128,7 @@ def command(
             result = registrar.register(source, target, **told)
     try:
         with stdout_to_stderr(), stage_display(quiet) as stage:
-            _write(outputs, result, explanation, source, inverse, force, stage)
+            _write(outputs, result, explanation, (source, target), inverse, force, stage)
     finally:  # a full disk must not cost the answer
         _print(result.inverse() if inverse else result, as_json, quiet, inverse)
     if show and explanation is not None:
@@ -174,14 +181,17 @@ def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> N
             raise OutputError(f"{option} '{path}' is also {owner}; give another name")
         taken[Path(path).resolve()] = option
     if outputs.aligned is not None:
-        check_aligned(outputs.aligned, inputs[0], precision=outputs.precision, force=force)
+        settings: dict[str, Any] = {"precision": outputs.precision, "distances": outputs.distances}
+        check_aligned(outputs.aligned, inputs[0], **settings, force=force)
+    elif outputs.distances:
+        raise click.UsageError("--distances writes into the file of --aligned; give --aligned FILE too")
 
 
 def _write(
     outputs: _Outputs,
     result: RegistrationResult,
     explanation: Explanation | None,
-    source: str,
+    inputs: tuple[str, str],
     inverse: bool,
     force: bool,
     stage: Callable[[str], None],
@@ -209,9 +219,10 @@ def _write(
 
             lost = save_aligned(
                 outputs.aligned,
-                source,
+                inputs[0],
                 result.T_target_source,
                 precision=outputs.precision,
+                target=inputs[1] if outputs.distances else None,
                 force=force,
                 remark=lambda sentence: click.echo(f"note: {sentence}", err=True),
             )

@@ -10,6 +10,7 @@ import click
 from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.result import CloudReport, RegistrationResult
 from geomoe3d.types import FloatArray
+from geomoe3d.visual.accuracy_facts import accuracy_facts
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}
 _MEANING = {
@@ -73,7 +74,7 @@ def _found(result: RegistrationResult) -> list[str]:
     if not math.isfinite(result.voxel_size):
         return []
     return [
-        _row("overlap", f"{result.overlap:.0%} of the source"),
+        *(_row(name, text) for name, text in accuracy_facts(result)),
         _row("inliers", _inliers(result)),
         _row("runner-up", _alternative(result)),
         _row("voxel size", f"{result.voxel_size:.6g}{_chosen(result)}"),

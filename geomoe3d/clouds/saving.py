@@ -15,17 +15,18 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geomoe3d.clouds.formats import e57, gltf, las, meshes
 from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS, take_inherited
-from geomoe3d.clouds.loading import describe, finite_part, is_sampled, read_raw, unknown_suffix
+from geomoe3d.clouds.loading import describe, finite_part, is_sampled, load_points, read_raw, unknown_suffix
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.clouds.vectors import turned
 from geomoe3d.errors import FormatError, InputError, NonFiniteError
 from geomoe3d.runtime.files import check_output, write_atomically
+from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import FloatArray
 
 WRITABLE_SUFFIXES = tuple(CLOUD_WRITERS)
@@ -117,15 +118,20 @@ def save_points(
 
 
 def check_aligned(
-    path: str | os.PathLike[str], source: Any, *, precision: str = "auto", force: bool = False
+    path: str | os.PathLike[str],
+    source: Any,
+    *,
+    precision: str = "auto",
+    distances: bool = False,
+    force: bool = False,
 ) -> Path:
     """Find out before work begins whether `save_aligned` could write ``path``, as far as that can be known.
 
     A source is looked into only where ``path`` can hold nothing but a mesh.
 
     Raises:
-        FormatError: a suffix that cannot be written, a mesh suffix for a cloud, or a precision that the
-            format does not know.
+        FormatError: a suffix that cannot be written, a mesh suffix for a cloud, a precision that the format
+            does not know, or distances where it has no place for them.
         DependencyError: what the format needs is not installed.
         OutputError, InputError: as `save_aligned`.
     """
@@ -139,6 +145,10 @@ def check_aligned(
         raise FormatError(
             f"'{path}': a precision can be chosen for {', '.join(_WITH_PRECISION)}; "
             f"{suffix} keeps what it can by itself"
+        )
+    if distances and suffix not in _WITH_FIELDS:
+        raise FormatError(
+            f"'{path}': {suffix} has no place for a distance at each point; use one of {', '.join(_WITH_FIELDS)}"
         )
     if suffix in (".las", ".laz"):
         las.require_laspy(suffix == ".laz")
@@ -158,6 +168,7 @@ def save_aligned(
     T_target_source: ArrayLike,
     *,
     precision: str = "auto",
+    target: Any = None,
     force: bool = False,
     remark: Callable[[str], None] = lambda sentence: None,
 ) -> tuple[str, ...]:
@@ -180,6 +191,8 @@ def save_aligned(
             move nothing by more than 1e-6 of the spread, and all digits elsewhere; "double" always writes all
             digits; "single" always writes floats, of coordinates far from zero minus an origin, which is
             stated in the header.
+        target: anything `load_points` takes: each point gets a field ``distance`` to the nearest point of it at
+            full resolution (NaN where (0, 0, 0) marks a missing measurement); None writes no such field.
         force: replace an existing file, which may be the source itself.
         remark: called with sentences on how the file can be read.
 
@@ -192,7 +205,7 @@ def save_aligned(
         OutputError: as `check_cloud_output`, or the disk refuses.
     """
     with np.errstate(all="ignore"):  # normals and fields may be any numbers
-        return _save_aligned(path, source, _rigid(T_target_source), precision, force, remark)
+        return _save_aligned(path, source, _rigid(T_target_source), precision, target, force, remark)
 
 
 def _save_aligned(
@@ -200,10 +213,11 @@ def _save_aligned(
     source: Any,
     T: FloatArray,
     precision: str,
+    target: Any,
     force: bool,
     remark: Callable[[str], None],
 ) -> tuple[str, ...]:
-    path = check_aligned(path, source, precision=precision, force=force)
+    path = check_aligned(path, source, precision=precision, distances=target is not None, force=force)
     suffix = path.suffix.lower()
     file = Path(source) if isinstance(source, (str, os.PathLike)) else None
     kind = "" if file is None else file.suffix.lower()
@@ -233,6 +247,10 @@ def _save_aligned(
         )
     moved, stayed = _moved(raw, T)
     lost += [f"{', '.join(stayed)} (kept, not turned)"] * bool(stayed)
+    if target is not None:
+        fields = {name: values for name, values in moved.fields.items() if name.lower() != DISTANCE}
+        lost += [name for name in moved.fields if name not in fields]
+        moved = replace(moved, fields={**fields, DISTANCE: _distances(moved.points, target)})
     write = (MESH_WRITERS if as_mesh else CLOUD_WRITERS)[suffix]
     if suffix in _WITH_PRECISION:
         single = precision == "single" or (precision == "auto" and fits_single_precision(moved.points))
@@ -249,6 +267,8 @@ def _save_aligned(
     return tuple(dict.fromkeys(lost))
 
 
+DISTANCE = "distance"
+_WITH_FIELDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".txt", ".asc", ".csv", ".npz")
 PRECISIONS = ("auto", "double", "single")
 _WITH_PRECISION = {  # and who cannot read all digits
     ".ply": "{path} holds doubles: the Point Cloud Library and small_gicp read them as an empty cloud "
@@ -270,6 +290,20 @@ def _moved(raw: RawCloud, T: FloatArray) -> tuple[RawCloud, tuple[str, ...]]:
     fields, stayed = turned(raw.fields, T[:3, :3])
     normals = None if raw.normals is None else raw.normals @ T[:3, :3].T
     return replace(raw, points=points, normals=normals, fields=fields), stayed
+
+
+def _distances(points: FloatArray, target: Any) -> NDArray[np.float32]:
+    """(N,) distance of each point (N, 3), file coordinates, to the nearest of a target at full resolution; NaN for
+    (0, 0, 0), which marks missing measurements where more than one point lies there."""
+    from scipy.spatial import cKDTree
+
+    cloud = load_points(target)
+    tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
+    distances = np.asarray(tree.query(points - cloud.origin, workers=usable_threads())[0]).astype(np.float32)
+    missing = ~points.any(axis=1)
+    if np.count_nonzero(missing) > 1:
+        distances[missing] = np.nan
+    return distances
 
 
 def _rigid(T: ArrayLike) -> FloatArray:

@@ -13,7 +13,7 @@ from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.confidence import Information, Judgement
 from geomoe3d.decision.scale import Scale
 from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames
-from geomoe3d.result import Alternative, CloudReport, RegistrationResult, Status
+from geomoe3d.result import Accuracy, Alternative, CloudReport, RegistrationResult, Status
 from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
@@ -33,6 +33,7 @@ class Decision:
         information, judgement: see their classes.
         hypotheses: all that were considered, best first, before refinement.
         scale: how large the source is beside the target under the answer, where that was measured.
+        accuracy: how closely the clouds lie on each other, where that was measured.
     """
 
     answer: Hypothesis | None
@@ -42,6 +43,7 @@ class Decision:
     judgement: Judgement
     hypotheses: tuple[Hypothesis, ...] = ()
     scale: Scale | None = None
+    accuracy: Accuracy | None = None
 
     @classmethod
     def failed(cls, reason: str) -> Decision:
@@ -117,6 +119,7 @@ def finished_result(
         seed=config.seed,
         versions=library_versions(),
         config=config.model_dump(mode="json"),
+        accuracy=decision.accuracy,
     )
 
 

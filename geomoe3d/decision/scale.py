@@ -12,16 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.decision.shared_surface import SharedSurface, distortion_of, robust_weights, solved
+from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray, PreparedCloud
 
 # In voxels: reach of the nearest neighbours from round to round, wide enough at first for a scale of 0.8.
 _REACHES = (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5)
-_LEAST_COSINE = 0.7
 _LEAST_MATCHED = 60  # of twelve unknowns
-_MOST_ASKED = 4000  # points of each cloud
-_CUT = 4.0  # residuals beyond so many robust deviations count for nothing
-_LEAST_DEVIATION = 0.05  # in voxels: means of a grid are no better
 _RANGE = (0.3, 3.0)
 # The error of the scale over the distortion, and of the fit over what independent points would leave: from
 # generated rooms; docs/measurements.md holds what came of it on real fragments.
@@ -88,78 +85,34 @@ class _Fit:
     """p_target = scale R p_source + t, improved step by step."""
 
     def __init__(self, T: FloatArray, source: PreparedCloud, target: PreparedCloud) -> None:
-        from scipy.spatial import cKDTree
-
         self.scale, self._R, self._t = 1.0, T[:3, :3], T[:3, 3]
-        self._clouds, self._voxel = (source, target), source.voxel_size
-        self._trees = tuple(cKDTree(cloud.points) for cloud in self._clouds)
-        self._asked = tuple(np.arange(0, len(c), -(-len(c) // _MOST_ASKED)) for c in self._clouds)
+        self._shared, self._voxel = SharedSurface(source, target), source.voxel_size
 
     def step(self, reach: float) -> bool:
         """One linear solution; False where too little matches or the scale leaves what is sought."""
         from scipy.spatial.transform import Rotation
 
-        points, normals, gaps = self._matched(reach)
+        contact = self._shared.contact(make_transform(self._R, self._t), reach, self.scale)
+        points, normals, gaps = contact.points, contact.normals, contact.gaps
         if len(points) < 2 * _LEAST_MATCHED:
             return False
-        spread = max(1.4826 * float(np.median(np.abs(gaps))), _LEAST_DEVIATION * self._voxel)
-        weights = np.maximum(1 - (gaps / (_CUT * spread)) ** 2, 0.0) ** 2
+        weights = robust_weights(gaps, self._voxel)
         center = points.mean(0)
         self._radius = float(np.sqrt(np.mean(np.sum((points - center) ** 2, axis=1))))
         self._rows = (points - center) / self._radius, normals, gaps, weights
         X = self._rows[0]
         J = np.hstack([np.cross(X, normals), normals, np.einsum("ij,ij->i", X, normals)[:, None]])
-        x, self._inverse, self._variance = _solved(J, gaps, weights)
+        x, self._inverse, self._variance = solved(J, gaps, weights)
         growth, turn = 1 + x[6] / self._radius, Rotation.from_rotvec(x[:3] / self._radius).as_matrix()
         self._t = center + growth * turn @ (self._t - center) + x[3:6]
         self._R, self.scale = turn @ self._R, self.scale * growth
         return _RANGE[0] < self.scale < _RANGE[1]
 
-    def _matched(self, reach: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points of the moved source, the normals that they are measured along, and the gaps to the target."""
-        (source, target), (rows, back_rows) = self._clouds, self._asked
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self.scale * self._R, self._t
-        moved, turned = transform_points(T, source.points), source.normals @ self._R.T
-        back = (target.points[back_rows] - self._t) @ self._R / self.scale
-        distance, nearest = (
-            np.asarray(v) for v in self._trees[1].query(moved[rows], distance_upper_bound=reach)
-        )
-        found = np.isfinite(distance)
-        ours, theirs = rows[found], nearest[found]
-        distance, nearest = (
-            np.asarray(v) for v in self._trees[0].query(back, distance_upper_bound=reach / self.scale)
-        )
-        found = np.isfinite(distance)
-        first = np.concatenate([ours, nearest[found]])
-        second = np.concatenate([theirs, back_rows[found]])
-        normals = np.vstack([target.normals[theirs], turned[nearest[found]]])
-        agree = np.abs(np.einsum("ij,ij->i", turned[first], target.normals[second])) > _LEAST_COSINE
-        points, normals = moved[first][agree], normals[agree]
-        gaps = np.einsum("ij,ij->i", target.points[second][agree] - points, normals)
-        return points, normals, gaps
-
     def deviation(self) -> float:
         """One standard deviation of ln(scale), from the distortion that is left and from the fit."""
-        X, normals, gaps, weights = self._rows
-        (x, y, z), (u, v, w) = X.T, normals.T
-        strain = np.stack([x * u, y * v, z * w, x * v + y * u, x * w + z * u, y * w + z * v], axis=1)
-        solved, _, _ = _solved(np.hstack([np.cross(X, normals), normals, strain]), gaps, weights)
-        xx, yy, zz, xy, xz, yz = solved[6:] / self._radius
-        E = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        distortion = float(np.linalg.norm(E - np.trace(E) / 3 * np.eye(3)))
+        distortion = distortion_of(*self._rows, self._radius)
         formal = float(np.sqrt(self._variance * self._inverse[6, 6])) / self._radius
         return float(np.hypot(_PER_DISTORTION * distortion, _PER_FORMAL * formal))
-
-
-def _solved(J: FloatArray, gaps: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Weighted least squares of J x = gaps, the inverse of the normal matrix, and the variance that is left."""
-    weighted = J * weights[:, None]
-    A = weighted.T @ J
-    # What nothing holds stays where it is.
-    inverse: FloatArray = np.linalg.inv(A + 1e-7 * np.trace(A) * np.eye(len(A)))
-    x = inverse @ (weighted.T @ gaps)
-    return x, inverse, float(weights @ (gaps - J @ x) ** 2 / weights.sum())
 
 
 def seeming_units(ratio: float) -> str:

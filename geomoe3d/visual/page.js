@@ -91,11 +91,26 @@
     const at = value / 255 * (SCALE.length - 1), low = Math.min(Math.floor(at), SCALE.length - 2), rest = at - low;
     return SCALE[low].map((v, i) => Math.round(v + rest * (SCALE[low + 1][i] - v)));
   }
-  const RAMP = Array.from({ length: 256 }, (_, i) => ramp(i));
+  const APART = [128, 132, 140]; // nothing of the target is near
+  const RAMP = Array.from({ length: 256 }, (_, i) => i < 255 ? ramp(i * 255 / 254) : APART);
+  /* How many points lie how far from the target: one bar for five of the 255 steps. */
+  function showHistogram(values) {
+    const bars = new Array(51).fill(0), near = values.filter((v) => v < 255);
+    for (const v of near) bars[Math.floor(v / 5)] += 1;
+    const most = Math.max(1, ...bars);
+    byId("histogram").replaceChildren(...bars.map((count) => {
+      const bar = document.createElement("i");
+      bar.style.height = `${100 * count / most}%`;
+      return bar;
+    }));
+    const apart = values.length - near.length, reach = data.distanceReach.toPrecision(3);
+    byId("beyond").textContent = `${near.length} of ${values.length} source points drawn have a target point within ${reach}`
+      + (apart ? "; the others are grey" : "");
+  }
   function paint() {
     for (const [name, cloud] of Object.entries(clouds)) {
       let plain = styleColor("--" + name);
-      if (state.color === "distance" && name === "target") plain = [128, 132, 140];
+      if (state.color === "distance" && name === "target") plain = APART;
       const values = name === "source" && state.color === "distance" ? distances[state.motion] : null;
       if (state.color === "file" && cloud.file) cloud.colors = cloud.file.slice();
       else {
@@ -105,6 +120,7 @@
       display.renderer.recolor(name, cloud.colors);
     }
     byId("scale").hidden = state.color !== "distance";
+    if (state.color === "distance" && distances[state.motion]) showHistogram(distances[state.motion]);
     invalidate();
   }
 

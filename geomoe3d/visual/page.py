@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import check_output, write_text
 from geomoe3d.types import FloatArray, IntArray
+from geomoe3d.visual.accuracy_facts import accuracy_facts
 from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
@@ -79,14 +80,15 @@ def _data(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
     """What the script needs, as JSON; arrays are base64 of little-endian float32 or uint8."""
     motions = {"before": drawing.before, "answer": drawing.after, "alternative": drawing.alternative}
     result = view.result
-    limit = 2.0 * result.inlier_threshold
-    if not (np.isfinite(limit) and limit > 0):  # a registration that failed before there was a threshold
-        limit = 0.1 * drawing.radius
+    reach = 2.0 * result.inlier_threshold
+    if not (np.isfinite(reach) and reach > 0):  # a registration that failed before there was a threshold
+        reach = 0.1 * drawing.radius
     distances = {
-        name: _base64_bytes(distance_to_target(view, drawing, motion, limit) / limit)
+        name: distance_to_target(view, drawing, motion, reach)
         for name, motion in motions.items()
         if name != "before" and motion is not None
     }
+    limit = distance_limit(distances.get("answer", np.zeros(0)), reach)
     return {
         "source": {
             "points": base64_floats(drawing.source),
@@ -103,13 +105,34 @@ def _data(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
             for name, T in motions.items()
             if T is not None
         },
-        "distances": distances,
+        "distances": {name: _levels(values, limit, reach) for name, values in distances.items()},
         "distanceLimit": limit,
+        "distanceReach": reach,
         "matrices": {name: _matrix_text(T) for name, T in _transforms(view).items()},
         "axes": drawing.axes.tolist(),
         "radius": drawing.radius,
         "spacing": drawing.spacing,
     }
+
+
+def distance_limit(distances: FloatArray, reach: float) -> float:
+    """The end of the colour scale: six robust deviations above the median distance, rounded up to two digits.
+
+    A quantile would be that of the rim, where the target ends and distances grow up to ``reach``.
+    """
+    near = distances[np.isfinite(distances)]
+    median = float(np.median(near)) if len(near) else 0.0
+    largest = median + 6 * 1.4826 * float(np.median(np.abs(near - median))) if len(near) else 0.0
+    if not largest > 0:
+        return reach
+    step = 10.0 ** (np.floor(np.log10(largest)) - 1)
+    return min(float(np.ceil(largest / step) * step), reach)
+
+
+def _levels(distances: FloatArray, limit: float, reach: float) -> str:
+    """One byte per point: 0 to 254 for 0 to ``limit`` and more; 255 where nothing lies within ``reach``."""
+    levels = np.where(distances < reach, np.minimum(distances / limit, 1.0) * 254.0 / 255.0, 1.0)
+    return _base64_bytes(levels)
 
 
 def _lines(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
@@ -160,7 +183,7 @@ def _facts(view: RegistrationView) -> list[tuple[str, str]]:
     result = view.result
     share = f" ({result.num_inliers / result.num_correspondences:.1%})" if result.num_correspondences else ""
     return [
-        ("overlap of source", number(result.overlap, ".1%")),
+        *accuracy_facts(result),
         ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences{share}"),
         ("inlier threshold", f"{result.inlier_threshold:.6g}"),
         ("voxel size", f"{result.voxel_size:.6g}"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import BoolArray
+from geomoe3d.visual.accuracy_facts import accuracy_facts
 from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
@@ -174,9 +175,8 @@ def draw_facts(axes: Axes, view: RegistrationView) -> None:
     facts = [
         ("status", STATUS_WORDS[result.status]),
         ("confidence", number(result.confidence, ".2f")),
-        ("overlap of source", number(result.overlap, ".0%")),
+        *((name, textwrap.fill(text.split(" (")[0], 38)) for name, text in accuracy_facts(result)),
         ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences"),
-        ("inlier threshold", f"{result.inlier_threshold:.4g}"),
         ("voxel size", f"{result.voxel_size:.4g}"),
     ]
     if result.seconds:
@@ -201,7 +201,7 @@ def draw_facts(axes: Axes, view: RegistrationView) -> None:
     lines: list[str] = []
     for reason in result.reasons:
         lines += textwrap.wrap(reason, 56, initial_indent="• ", subsequent_indent="   ")
-    room = int((y + 0.05) / 0.049)
+    room = max(int((y + 0.05) / 0.049), 1)
     if len(lines) > room:
         lines = [*lines[: max(room - 1, 0)], "… more in the result file"]
     axes.text(

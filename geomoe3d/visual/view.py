@@ -35,7 +35,7 @@ class RegistrationView:
         source_colors: (N, 3) in [0, 1] or None.
         target_colors: (M, 3) in [0, 1] or None.
         groups: (K,) non-negative group of each correspondence, or None. When given, correspondences are
-            coloured by group instead of kept or rejected.
+            coloured by group instead of inlier or outlier.
         group_names: name of group 0, 1, ...; groups beyond it are called by their number.
         weight_threshold: a correspondence counts as kept where its weight is larger than this.
 
@@ -112,21 +112,21 @@ class RegistrationView:
         return residuals(self.result.T_target_source, rows[:, :3], rows[:, 3:])
 
     def kept(self) -> BoolArray:
-        """(K,) True where the filter keeps a correspondence; without weights, where the transform agrees.
+        """(K,) True where a correspondence agrees with the transform: the inliers of the answer.
 
-        All False where there is neither a filter nor a transform.
+        Without a transform, where the filter keeps it; all False where there is neither.
         """
-        if self.weights is not None:
-            return np.asarray(self.weights > self.weight_threshold)
-        return np.asarray(self.residuals() <= self.result.inlier_threshold)  # NaN compares as False
+        if self.has_transform or self.weights is None:
+            return np.asarray(self.residuals() < self.result.inlier_threshold)  # NaN compares as False
+        return np.asarray(self.weights > self.weight_threshold)
 
     @property
     def kept_words(self) -> tuple[str, str]:
         """What the two sides of `kept` are called in a legend."""
+        if self.has_transform:
+            return "inliers of the answer", "outliers"
         if self.weights is not None:
             return "kept by the filter", "rejected by the filter"
-        if self.has_transform:
-            return "agrees with the transform", "disagrees"
         return "kept", "not judged (no transform)"
 
     def group_label(self, group: int) -> str:

@@ -263,13 +263,20 @@ class RegistrationResult:
         return save_aligned(path, data, self._transform(), target=other if distances else None, force=force)
 
     def picture(
-        self, path: str | os.PathLike[str], *, source: Any = None, target: Any = None, force: bool = False
+        self,
+        path: str | os.PathLike[str],
+        *,
+        source: Any = None,
+        target: Any = None,
+        unit: str = "",
+        force: bool = False,
     ) -> None:
         """Draw before, after, correspondences and residuals into one picture (``register --picture``).
 
         Args:
             path: .png, .pdf, .svg, .jpg or .webp.
             source, target: None takes what was registered, loaded again.
+            unit: name of the files' unit of length, such as "m", for the numbers; empty where it is not known.
             force: replace an existing file.
 
         Raises:
@@ -278,10 +285,16 @@ class RegistrationResult:
         """
         from geomoe3d.visual.picture import save_picture
 
-        save_picture(self._view(source, target), path, force=force)
+        save_picture(self._view(source, target, unit), path, force=force)
 
     def page(
-        self, path: str | os.PathLike[str], *, source: Any = None, target: Any = None, force: bool = False
+        self,
+        path: str | os.PathLike[str],
+        *,
+        source: Any = None,
+        target: Any = None,
+        unit: str = "",
+        force: bool = False,
     ) -> None:
         """Write a page in which the clouds can be turned (``register --page``); arguments as `picture`.
 
@@ -290,7 +303,25 @@ class RegistrationResult:
         """
         from geomoe3d.visual.page import save_page
 
-        save_page(self._view(source, target), path, force=force)
+        save_page(self._view(source, target, unit), path, force=force)
+
+    def report(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        source: Any = None,
+        target: Any = None,
+        unit: str = "",
+        force: bool = False,
+    ) -> None:
+        """Write one sheet for a customer as PDF (``register --report``); arguments as `picture`.
+
+        Raises:
+            InputError, FormatError, OutputError: as `picture`.
+        """
+        from geomoe3d.visual.sheet import save_sheet
+
+        save_sheet(self._view(source, target, unit), path, force=force)
 
     def __repr__(self) -> str:
         return f"<RegistrationResult {self._words()}>"
@@ -331,13 +362,13 @@ class RegistrationResult:
             )
         return self.T_target_source
 
-    def _view(self, source: Any, target: Any) -> RegistrationView:
+    def _view(self, source: Any, target: Any, unit: str = "") -> RegistrationView:
         from geomoe3d.visual.view import RegistrationView
 
         kept = self._inputs or Inputs(None, None)
         clouds = kept.clouds(source, target, self.seed)
         found = kept.correspondences, kept.weights, kept.groups, kept.group_names
-        return RegistrationView.of(self, clouds, *found)
+        return RegistrationView.of(self, clouds, *found, unit)
 
     def _with_inputs(self, inputs: Inputs) -> RegistrationResult:
         """The same result, which knows what it was made of."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cloud_files import fails, small_cloud
 
-from geomoe3d.clouds.io import load_points, save_points
+from geomoe3d.clouds.io import load_points, save_aligned, save_points
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.errors import EmptyCloudError
 
@@ -141,3 +141,6 @@ def test_names_in_quotes_are_names(tmp_path: Path) -> None:
     cloud = read_raw(tmp_path / "a.csv")
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
     assert list(cloud.fields) == ["intensity"]
+    (tmp_path / "a.csv").write_text('x,y,z,,""\n1,2,3,7,8\n4,5,6,7,8\n')
+    assert list(read_raw(tmp_path / "a.csv").fields) == ["column_4", "column_5"]
+    assert save_aligned(tmp_path / "a.ply", tmp_path / "a.csv", np.eye(4)) == ()

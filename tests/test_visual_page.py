@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -43,6 +44,14 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.texts.append((self.open[-1] if self.open else "", data))
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Headed rows of the tables."""
+        cells = [text for tag, text in self.texts if tag in ("th", "td")]
+        heads = [
+            k for k, (tag, _) in enumerate(t for t in self.texts if t[0] in ("th", "td")) if tag == "th"
+        ]
+        return [(cells[k], cells[k + 1]) for k in heads]
 
     def data(self) -> dict:
         return json.loads(max((text for tag, text in self.texts if tag == "script"), key=len))
@@ -234,7 +243,59 @@ def test_page_in_a_browser(tmp_path, webgl):
     assert camera(log["zoomed"])[distance] == pytest.approx(0.87 * moved[distance], rel=1e-4)
     top = camera(log["top"])
     assert top[pitch] == pytest.approx(np.pi / 2, rel=1e-5)
-    np.testing.assert_allclose(top[3:], start[3:])
+
+
+PHONE = """
+(async () => {
+  const stage = document.getElementById("stage");
+  await settle();
+  for (const side of ["home", "top", "front", "side"]) {
+    document.querySelector(`[data-side="${side}"]`).click();
+    await settle();
+    document.body.dataset["at" + side] = document.body.dataset.camera;
+  }
+  document.body.dataset.size = stage.clientWidth + " " + stage.clientHeight;
+})();
+"""
+
+
+@pytest.mark.parametrize("window", ["390,844", "1280,800", "500,300"])
+def test_nothing_is_cut_off_on_a_phone_or_elsewhere(tmp_path, window):
+    view = nasty_view()
+    text = render_page(view)
+    seen = browse(tmp_path, text, script=HAND + PHONE, webgl=False, window=window)
+    assert "error" not in seen, seen["error"]
+    width, height = (float(v) for v in seen["size"].split())
+    scene, data = build_drawing(view, max_points=50_000), Page(text).data()
+    points = np.concatenate([scene.target, transform_points(scene.after, scene.source)])
+    right, forward, up = np.array(data["axes"])
+    for side in ("home", "top", "front", "side"):
+        yaw, pitch, distance, *center = (float(v) for v in seen[f"at{side}"].split())
+        level = np.cos(yaw) * forward - np.sin(yaw) * right
+        across = np.cos(yaw) * right + np.sin(yaw) * forward
+        above, look = np.sin(pitch) * level + np.cos(pitch) * up, np.cos(pitch) * level - np.sin(pitch) * up
+        at = points - center
+        depth = (distance + at @ look) * np.tan(np.radians(20))
+        shown = np.abs(np.stack([at @ across / (depth * width / height), at @ above / depth]))
+        assert np.mean(shown.max(axis=0) > 1) < 0.005, side
+        assert shown.max(axis=1).max() > 0.7, side  # and it fills the stage
+
+
+def test_lengths_have_the_name_of_their_unit():
+    view = nasty_view()
+    assert "0.05" in dict(Page(render_page(view)).rows())["voxel size"]
+    rows = dict(Page(render_page(replace(view, unit="mm"))).rows())
+    assert rows["voxel size"] == "0.05 mm" and rows["inlier threshold"].endswith(" mm")
+
+
+def test_the_alternative_is_shown_where_it_matters(tmp_path):
+    view = nasty_view()
+    other = view.result.alternative
+    for status, score, shown in (("ok", 0.1, False), ("ok", 0.5, True), ("ambiguous", 0.1, True)):
+        result = replace(view.result, status=status, alternative=replace(other, relative_score=score))
+        text = render_page(replace(view, result=result))
+        assert ("Alternative" in text) == shown
+        assert (Page(text).data()["motions"]["alternative"] is not None) == shown
 
 
 @pytest.mark.parametrize("webgl", [True, False], ids=["webgl2", "canvas2d"])

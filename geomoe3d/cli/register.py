@@ -30,6 +30,8 @@ class _Outputs:
     distances: bool
     picture: str | None
     page: str | None
+    report: str | None
+    unit: str
 
 
 @click.command(context_settings=HELP, short_help="Lay one scan on another, and say how sure.")
@@ -64,6 +66,10 @@ class _Outputs:
 @part_option("writer")
 @click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
 @click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
+@click.option("--report", metavar="FILE", help="Write one sheet for a customer: .pdf.")
+@click.option(
+    "--unit", metavar="NAME", default="", help="Name of the files' unit of length, such as m, for the eye."
+)
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
 @click.option("--force", is_flag=True, help="Replace output files that exist.")
 @click.option(
@@ -89,6 +95,8 @@ def command(
     distances: bool,
     picture: str | None,
     page: str | None,
+    report: str | None,
+    unit: str,
     show: bool,
     force: bool,
     quiet: bool,
@@ -100,7 +108,7 @@ def command(
     low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
     """
 
-    outputs = _Outputs(output, aligned, aligned_precision, distances, picture, page)
+    outputs = _Outputs(output, aligned, aligned_precision, distances, picture, page, report, unit)
     _check_outputs(outputs, (source, target), force)
     if show:
         from geomoe3d.visual.window import check_display
@@ -121,7 +129,7 @@ def command(
         registrar = Registrar(config if weights is None else with_weights(config, weights))
         told: dict[str, Any] = {"initial": guess, "correspondences": matches, "progress": stage}
         explanation: Explanation | None = None
-        if picture is not None or page is not None or show:
+        if picture is not None or page is not None or report is not None or show:
             explanation = registrar.explain(source, target, **told)
             result = explanation.result
         else:
@@ -130,15 +138,15 @@ def command(
         with stdout_to_stderr(), stage_display(quiet) as stage:
             _write(outputs, result, explanation, (source, target), inverse, force, stage)
     finally:  # a full disk must not cost the answer
-        _print(result.inverse() if inverse else result, as_json, quiet, inverse)
+        _print(result.inverse() if inverse else result, as_json, quiet, inverse, unit)
     if show and explanation is not None:
         from geomoe3d.visual.window import show_window
 
-        show_window(explanation.view())
+        show_window(explanation.view(unit))
     context.exit(0 if result.ok else NOT_SURE)
 
 
-def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: bool) -> None:
+def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: bool, unit: str) -> None:
     if as_json:
         click.echo(answer.to_json())
     elif quiet:
@@ -152,7 +160,7 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
         from geomoe3d.cli.summary import summary
 
         color = False if os.environ.get("NO_COLOR") else None
-        click.echo(summary(answer, inverted), color=color)
+        click.echo(summary(answer, inverted, unit), color=color)
 
 
 def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> None:
@@ -168,6 +176,7 @@ def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> N
         ("--aligned", outputs.aligned, ()),
         ("--picture", outputs.picture, FORMATS),
         ("--page", outputs.page, (".html", ".htm")),
+        ("--report", outputs.report, (".pdf",)),
     )
     taken = {Path(path).resolve(): "an input" for path in inputs}
     for option, path, suffixes in wanted:
@@ -228,8 +237,8 @@ def _write(
             )
         else:
             skipped.append(outputs.aligned)
-    if explanation is not None and (outputs.picture is not None or outputs.page is not None):
-        view = explanation.view()
+    if explanation is not None and (outputs.picture or outputs.page or outputs.report):
+        view = explanation.view(outputs.unit)
         if outputs.picture is not None:
             stage("draw the picture")
             from geomoe3d.visual.picture import save_picture
@@ -240,6 +249,11 @@ def _write(
             from geomoe3d.visual.page import save_page
 
             save_page(view, outputs.page, force=force)
+        if outputs.report is not None:
+            stage("draw the report")
+            from geomoe3d.visual.sheet import save_sheet
+
+            save_sheet(view, outputs.report, force=force)
     if lost:
         click.echo(f"not carried over to {outputs.aligned}: {', '.join(lost)}", err=True)
     for path in skipped:

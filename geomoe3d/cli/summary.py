@@ -10,7 +10,7 @@ import click
 from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.result import CloudReport, RegistrationResult
 from geomoe3d.types import FloatArray
-from geomoe3d.visual.accuracy_facts import accuracy_facts
+from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}
 _MEANING = {
@@ -21,12 +21,13 @@ _MEANING = {
 }
 
 
-def summary(result: RegistrationResult, inverted: bool = False) -> str:
+def summary(result: RegistrationResult, inverted: bool = False, unit: str = "") -> str:
     """The whole answer as text with terminal colours (`click.echo` drops them where nobody sees them).
 
     Args:
         result: what is to be shown.
         inverted: whether `result` is the inverse of what was asked, its source the user's target.
+        unit: name of the files' unit of length, or empty.
     """
     first, second = (result.target, result.source) if inverted else (result.source, result.target)
     lines = [
@@ -34,7 +35,7 @@ def summary(result: RegistrationResult, inverted: bool = False) -> str:
         + f": {_MEANING[result.status]} (confidence {result.confidence:.2f})",
         *(f"  {reason}" for reason in result.reasons),
         "",
-        *_found(result),
+        *_found(result, unit),
         _row("source", _cloud(first)),
         _row("target", _cloud(second)),
         _row("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in result.seconds.items())),
@@ -69,22 +70,22 @@ def _row(name: str, text: str) -> str:
     return f"{name:12}{text}"
 
 
-def _found(result: RegistrationResult) -> list[str]:
+def _found(result: RegistrationResult, unit: str) -> list[str]:
     """The rows of what was measured; none where a pair was given up before."""
     if not math.isfinite(result.voxel_size):
         return []
     return [
-        *(_row(name, text) for name, text in accuracy_facts(result)),
-        _row("inliers", _inliers(result)),
-        _row("runner-up", _alternative(result)),
-        _row("voxel size", f"{result.voxel_size:.6g}{_chosen(result)}"),
+        *(_row(name, text) for name, text in accuracy_facts(result, unit)),
+        _row("inliers", _inliers(result, unit)),
+        _row("runner-up", _alternative(result, unit)),
+        _row("voxel size", f"{length(result.voxel_size, unit)}{_chosen(result)}"),
     ]
 
 
-def _inliers(result: RegistrationResult) -> str:
+def _inliers(result: RegistrationResult, unit: str) -> str:
     return (
         f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences within "
-        f"{result.inlier_threshold:.6g}"
+        f"{length(result.inlier_threshold, unit)}"
     )
 
 
@@ -107,11 +108,11 @@ def _cloud(cloud: CloudReport) -> str:
     return text + (f"; dropped {', '.join(dropped)}" if dropped else "; nothing dropped")
 
 
-def _alternative(result: RegistrationResult) -> str:
+def _alternative(result: RegistrationResult, unit: str) -> str:
     other = result.alternative
     if other is None:
         return "none that differs clearly comes near"
     return (
         f"{100 * other.relative_score:.0f} % of the score, "
-        f"differs by {other.rotation_difference_deg:.1f} deg and {other.translation_difference:.4g}"
+        f"differs by {other.rotation_difference_deg:.1f} deg and {length(other.translation_difference, unit, '.4g')}"
     )

@@ -42,13 +42,13 @@ class Explanation:
         """(K,) the filter's weights."""
         return self.weighed.weights
 
-    def view(self) -> RegistrationView:
-        """What the displays take: clouds, answer and correspondences in file coordinates."""
+    def view(self, unit: str = "") -> RegistrationView:
+        """What the displays take: clouds, answer and correspondences in file coordinates, and their unit's name."""
         from geomoe3d.visual.view import RegistrationView
 
         made = self._inputs(None, None)
         found = made.correspondences, made.weights, made.groups, made.group_names
-        return RegistrationView.of(self.result, (self.source, self.target), *found)
+        return RegistrationView.of(self.result, (self.source, self.target), *found, unit)
 
     def remembering(self, source: Any, target: Any) -> Explanation:
         """With a result that knows what it was made of: the data as the caller gave them."""

@@ -11,6 +11,7 @@
     clouds[name] = { points: floats(points) };
     clouds[name].colors = oneColor(clouds[name].points.length, parseColor(color));
   }
+  const everything = Float64Array.from(Object.values(clouds).flatMap((cloud) => [...sample(cloud.points)]));
   const state = { size: 0, hidden: new Set(), classes: data.lines.classes.map((kind) => kind.shown) };
 
   /* ---------- camera and canvas ---------- */
@@ -20,7 +21,7 @@
     axes: data.axes, radius: data.radius, sides: { home: [-0.6, 0.6], ...SIDES }, changed: invalidate,
   });
   function draw() {
-    if (camera.fitted) camera.fit([0, 0, 0], data.radius);
+    if (camera.fitted) camera.fit([0, 0, 0], data.radius, everything);
     const shown = Object.keys(clouds).filter((name) => !state.hidden.has(name)).map((name) => ({ name, model: STILL }));
     const num = display.show(camera, { model: STILL, clouds: shown, classes: state.classes,
       diameter: 0.8 * data.spacing * 2 ** state.size });

@@ -12,26 +12,32 @@ if TYPE_CHECKING:
 _MILLIMETRES = 1000.0
 
 
-def accuracy_facts(result: RegistrationResult) -> list[tuple[str, str]]:
+def length(value: float, unit: str, form: str = ".6g") -> str:
+    """A length in words, with the name of its unit where that is known."""
+    return f"{value:{form}} {unit}".rstrip()
+
+
+def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str, str]]:
     """Name and text of each figure, lengths in the files' unit; no more than the overlap where nothing was measured."""
     found = result.accuracy
     if found is None:
         overlap = f"{result.overlap:.0%} of the source" if np.isfinite(result.overlap) else "not known"
         return [("overlap", overlap)]
     near, far = found.sigma_center, found.sigma_farthest
-    metres = f"{near * _MILLIMETRES:.3g} and {far * _MILLIMETRES:.3g} mm if the unit is the metre"
+    guess = "" if unit else " if the unit is the metre"
+    metres = f" ({near * _MILLIMETRES:.3g} and {far * _MILLIMETRES:.3g} mm{guess})"
     held = "one deviation" if result.ok else "one deviation, if the answer is right"
     return [
         ("overlap", f"{found.overlap_source:.0%} of the source, {found.overlap_target:.0%} of the target"),
-        ("inlier RMSE", f"{found.inlier_rmse:.3g}"),
+        ("inlier RMSE", length(found.inlier_rmse, unit, ".3g")),
         (
             "distance",
             f"mean {found.distance_mean:.3g}, median {found.distance_median:.3g}, standard deviation "
-            f"{found.distance_std:.3g}, 95 % within {found.distance_p95:.3g}",
+            f"{found.distance_std:.3g}, 95 % within {length(found.distance_p95, unit, '.3g')}",
         ),
         (
             "uncertainty",
-            f"{held}: {near:.3g} at the overlap's centre, {far:.3g} at the farthest point, "
-            f"{found.sigma_rotation_deg:.2g} deg ({metres})",
+            f"{held}: {length(near, unit, '.3g')} at the overlap's centre, {length(far, unit, '.3g')} at the farthest "
+            f"point, {found.sigma_rotation_deg:.2g} deg{metres if unit in ('', 'm') else ''}",
         ),
     ]

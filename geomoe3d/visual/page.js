@@ -80,7 +80,8 @@
   // Until the user moves or zooms, the view follows both clouds on their way from before to after.
   function fit() {
     const from = data.fits.before, to = data.fits[state.motion] || from, s = state.progress;
-    camera.fit(from.center.map((v, i) => (1 - s) * v + s * to.center[i]), (1 - s) * from.radius + s * to.radius);
+    const seen = Float64Array.of(...sample(clouds.target.points), ...sample(clouds.source.points, sourceModel()));
+    camera.fit(from.center.map((v, i) => (1 - s) * v + s * to.center[i]), (1 - s) * from.radius + s * to.radius, seen);
   }
 
   /* ---------- colours ---------- */
@@ -182,7 +183,7 @@
   byId("motions").hidden = !data.motions.alternative;
   byId("color-file").hidden = !(clouds.source.file || clouds.target.file);
   byId("color-distance").hidden = !distances.answer;
-  byId("limit").textContent = "≥ " + data.distanceLimit.toPrecision(3);
+  byId("limit").textContent = `≥ ${data.distanceLimit.toPrecision(3)} ${data.unit}`;
   if (!data.motions.answer) for (const id of ["progress", "play"]) byId(id).disabled = true;
   byId("progress").value = String(state.progress);
 

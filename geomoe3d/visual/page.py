@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import check_output, write_text
 from geomoe3d.types import FloatArray, IntArray
-from geomoe3d.visual.accuracy_facts import accuracy_facts
+from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
@@ -72,17 +72,16 @@ def render_page(view: RegistrationView, *, max_points: int = MAX_POINTS) -> str:
         "matrices": {key: _shown_matrix(T, result.voxel_size) for key, T in _transforms(view).items()},
         "tables": {"Numbers": _facts(view), "Time": [(k, f"{s:.3f} s") for k, s in result.seconds.items()]},
         "drawn": _drawn(view, drawing),
+        "unit": view.unit,
     }
     return render_cloud_page("visual", "page", values, _data(view, drawing))
 
 
 def _data(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
     """What the script needs, as JSON; arrays are base64 of little-endian float32 or uint8."""
-    motions = {"before": drawing.before, "answer": drawing.after, "alternative": drawing.alternative}
-    result = view.result
-    reach = 2.0 * result.inlier_threshold
-    if not (np.isfinite(reach) and reach > 0):  # a registration that failed before there was a threshold
-        reach = 0.1 * drawing.radius
+    motions = {"before": drawing.before, "answer": drawing.after}
+    motions["alternative"] = None if view.rival is None else drawing.alternative
+    reach = distance_reach(view, drawing)
     distances = {
         name: distance_to_target(view, drawing, motion, reach)
         for name, motion in motions.items()
@@ -112,7 +111,16 @@ def _data(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
         "axes": drawing.axes.tolist(),
         "radius": drawing.radius,
         "spacing": drawing.spacing,
+        "unit": view.unit,
     }
+
+
+def distance_reach(view: RegistrationView, drawing: Drawing) -> float:
+    """Up to where distances to the target are looked for: two inlier thresholds."""
+    reach = 2.0 * view.result.inlier_threshold
+    if not (np.isfinite(reach) and reach > 0):  # a registration that failed before there was a threshold
+        return 0.1 * drawing.radius
+    return reach
 
 
 def distance_limit(distances: FloatArray, reach: float) -> float:
@@ -168,8 +176,8 @@ def _transforms(view: RegistrationView) -> dict[str, FloatArray]:
     """The answer and the alternative, as far as there are any."""
     result = view.result
     found = {"answer": result.T_target_source} if view.has_transform else {}
-    if found and result.alternative is not None and np.isfinite(result.alternative.T_target_source).all():
-        found["alternative"] = result.alternative.T_target_source
+    if found and view.rival is not None:
+        found["alternative"] = view.rival.T_target_source
     return found
 
 
@@ -183,10 +191,10 @@ def _facts(view: RegistrationView) -> list[tuple[str, str]]:
     result = view.result
     share = f" ({result.num_inliers / result.num_correspondences:.1%})" if result.num_correspondences else ""
     return [
-        *accuracy_facts(result),
+        *accuracy_facts(result, view.unit),
         ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences{share}"),
-        ("inlier threshold", f"{result.inlier_threshold:.6g}"),
-        ("voxel size", f"{result.voxel_size:.6g}"),
+        ("inlier threshold", length(result.inlier_threshold, view.unit)),
+        ("voxel size", length(result.voxel_size, view.unit)),
         ("source points", f"{len(view.source_points):,}"),
         ("target points", f"{len(view.target_points):,}"),
         ("seed", str(result.seed)),
@@ -206,8 +214,9 @@ def _drawn(view: RegistrationView, drawing: Drawing) -> str:
         text += f", chosen evenly over the surface with seed {view.result.seed}"
     text += f". Up is taken from the target's file ({drawing.up_words})."
     if drawing.apart is not None:
+        apart = length(drawing.apart, view.unit or "units", ",.6g")
         text += (
-            f" In their files the clouds lie {drawing.apart:,.6g} units apart, too far to be drawn:"
+            f" In their files the clouds lie {apart} apart, too far to be drawn:"
             " before draws the source beside the target."
         )
     if view.has_transform:

@@ -40,6 +40,18 @@ function unpackLines({ vertices, classes }) {
   return { vertices: places, ends: Float32Array.from({ length: 2 * num }, (_, i) => i % 2), colors, ranges };
 }
 
+/* Every so many points of a cloud, about a thousand, under a motion: what a camera is fitted to. */
+function sample(points, model = STILL) {
+  const step = 3 * Math.max(1, Math.floor(points.length / 3000)), num = Math.ceil(points.length / step);
+  const found = new Float64Array(3 * num);
+  for (let i = 0; i < num; i++) for (let k = 0; k < 3; k++) {
+    let sum = model[12 + k];
+    for (let j = 0; j < 3; j++) sum += model[4 * j + k] * points[step * i + j];
+    found[3 * i + k] = sum;
+  }
+  return found;
+}
+
 /* ---------- camera ---------- */
 const FIELD = 40 * Math.PI / 180;
 const SIDES = { top: [0, Math.PI / 2], front: [0, 0], side: [Math.PI / 2, 0] }; // yaw and pitch
@@ -51,12 +63,12 @@ class Camera {
   constructor(stage, { axes, radius, sides, limits = [0.02, 40], margin = 1.05, changed }) {
     Object.assign(this, { stage, axes, radius, sides, limits, margin, changed });
     Object.assign(this, { distance: 1, center: [0, 0, 0], fitted: true, cut: 0 });
-    [this.yaw, this.pitch] = Object.values(sides)[0];
+    [this.yaw, this.pitch] = this.begun = Object.values(sides)[0];
   }
 
-  directions() {
+  directions(yaw = this.yaw, pitch = this.pitch) {
     const [right, forward, up] = this.axes;
-    const [cy, sy, cp, sp] = [Math.cos(this.yaw), Math.sin(this.yaw), Math.cos(this.pitch), Math.sin(this.pitch)];
+    const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
     const level = forward.map((v, i) => cy * v - sy * right[i]);
     return {
       across: right.map((v, i) => cy * v + sy * forward[i]),
@@ -83,15 +95,36 @@ class Camera {
     return { view, projection, near, far, pixelsPerUnit: focal * height / 2 };
   }
 
-  fit(center, radius) {
+  /* Brings a ball into view; then, of points [x, y, z, ...] if given, all but a few strays as they look from the side
+     last chosen, so that nothing is cut off and turning does not zoom. */
+  fit(center, radius, points = null) {
     const { clientWidth, clientHeight } = this.stage;
-    const narrow = Math.min(1, Math.max(1, clientWidth) / Math.max(1, clientHeight));
+    const aspect = Math.max(1, clientWidth) / Math.max(1, clientHeight);
     this.center = center;
-    this.distance = this.margin * radius / Math.sin(FIELD / 2) / narrow;
+    this.distance = this.margin * radius / Math.sin(FIELD / 2) / Math.min(1, aspect);
+    if (!points || points.length < 30) return;
+    const { across, above, look } = this.directions(...this.begun), half = Math.tan(FIELD / 2) / (1.03 * this.margin);
+    const middle = (values) => {
+      values.sort();
+      const few = Math.floor(values.length / 1000);
+      return [values[few], values[values.length - 1 - few]];
+    };
+    for (let turn = 0; turn < 8; turn++) {
+      const u = new Float64Array(points.length / 3), v = u.slice(), [cx, cy, cz] = this.center;
+      for (let i = 0; i < u.length; i++) {
+        const x = points[3 * i] - cx, y = points[3 * i + 1] - cy, z = points[3 * i + 2] - cz;
+        const depth = Math.max(0.05 * radius, this.distance + x * look[0] + y * look[1] + z * look[2]);
+        u[i] = (x * across[0] + y * across[1] + z * across[2]) / depth;
+        v[i] = (x * above[0] + y * above[1] + z * above[2]) / depth;
+      }
+      const [[left, right], [low, high]] = [middle(u), middle(v)], before = this.distance;
+      this.center = this.center.map((c, k) => c + before / 2 * ((left + right) * across[k] + (low + high) * above[k]));
+      this.distance *= Math.max((right - left) / (2 * half * aspect), (high - low) / (2 * half), 0.05);
+    }
   }
 
   goTo(side) {
-    [this.yaw, this.pitch] = this.sides[side] || Object.values(this.sides)[0];
+    [this.yaw, this.pitch] = this.begun = this.sides[side] || Object.values(this.sides)[0];
     this.fitted = true;
     this.changed();
   }

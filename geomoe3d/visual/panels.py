@@ -9,7 +9,7 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import BoolArray
-from geomoe3d.visual.accuracy_facts import accuracy_facts
+from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
@@ -149,7 +149,7 @@ def draw_residuals(axes: Axes, view: RegistrationView) -> None:
     axes.text(
         threshold,
         0.985,
-        f" inlier threshold {threshold:.3g}  \n {inside:,} of {len(residuals):,} below  ",
+        f" inlier threshold {length(threshold, view.unit, '.3g')}  \n {inside:,} of {len(residuals):,} below  ",
         transform=axes.get_xaxis_transform(),
         va="top",
         ha="right" if threshold > np.sqrt(low * high) else "left",
@@ -158,7 +158,9 @@ def draw_residuals(axes: Axes, view: RegistrationView) -> None:
         bbox=LABEL_BOX,
     )
     axes.set_xlabel(
-        "distance of the moved source point to its target point (cloud units)", fontsize=9.5, color=SOFT
+        f"distance of the moved source point to its target point ({view.unit or 'unit of the files'})",
+        fontsize=9.5,
+        color=SOFT,
     )
     axes.set_ylabel("correspondences", fontsize=9.5, color=SOFT)
     axes.tick_params(labelsize=9, colors=SOFT)
@@ -175,18 +177,19 @@ def draw_facts(axes: Axes, view: RegistrationView) -> None:
     facts = [
         ("status", STATUS_WORDS[result.status]),
         ("confidence", number(result.confidence, ".2f")),
-        *((name, textwrap.fill(text.split(" (")[0], 38)) for name, text in accuracy_facts(result)),
+        *((name, textwrap.fill(text.split(" (")[0], 38)) for name, text in accuracy_facts(result, view.unit)),
         ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences"),
-        ("voxel size", f"{result.voxel_size:.4g}"),
+        ("voxel size", length(result.voxel_size, view.unit, ".4g")),
     ]
     if result.seconds:
         facts.append(("seconds", f"{result.seconds.get('total', sum(result.seconds.values())):.2f}"))
-    if result.alternative is not None:
-        other = result.alternative
+    other = view.rival
+    if other is not None:
+        away = length(other.translation_difference, view.unit, ".3g")
         facts.append(
             (
                 "alternative",
-                f"{other.rotation_difference_deg:.1f}° and {other.translation_difference:.3g} away,\n"
+                f"{other.rotation_difference_deg:.1f}° and {away} away,\n"
                 f"score {other.relative_score:.2f} of the answer's",
             )
         )

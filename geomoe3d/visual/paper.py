@@ -44,12 +44,14 @@ def show(axes: Axes, image: FloatArray, center: FloatArray, half: FloatArray) ->
     axes.set_ylim(low[1], high[1])
 
 
-def draw_scale_bar(axes: Axes, half: FloatArray, center: FloatArray) -> None:
-    """A round length in the lower left corner of a panel shown by `show`."""
+def draw_scale_bar(axes: Axes, half: FloatArray, center: FloatArray, unit: str) -> None:
+    """A round length in the lower left corner of a panel shown by `show`, with the name of its unit if known."""
     length = nice_length(0.4 * float(half[0]))
     x, y = center[0] - 0.96 * half[0], center[1] - 0.92 * half[1]
     axes.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
-    text = axes.text(x, y + 0.03 * half[1], f"{length:g} (cloud units)", fontsize=9, color=INK, va="bottom")
+    text = axes.text(
+        x, y + 0.03 * half[1], f"{length:g} {unit or 'units'}", fontsize=9, color=INK, va="bottom"
+    )
     text.set_bbox(LABEL_BOX)
 
 

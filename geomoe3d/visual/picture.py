@@ -18,6 +18,7 @@ from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
+from geomoe3d.visual.accuracy_facts import length
 from geomoe3d.visual.drawing import (
     SOURCE_COLOR,
     STATUS_COLORS,
@@ -101,9 +102,9 @@ def draw_picture(view: RegistrationView, *, fineness: float = 1.0) -> Figure:
         panels[0].set_title(title, loc="left", fontsize=13, fontweight="bold", color=INK, pad=8)
         panels[-1].set_title(note, loc="right", fontsize=10, color=SOFT, pad=8)
         if motion is None:
-            _draw_absent(panels, "no transform was found: there is nothing to show")
+            draw_absent(panels, "no transform was found: there is nothing to show")
         else:
-            _draw_sides(figure, panels, drawing, motion, fineness)
+            draw_sides(figure, panels, drawing, motion, fineness, view.unit)
     below = rows[2].subgridspec(1, 3, wspace=0.13, width_ratios=(1.22, 0.83, 0.95))
     draw_correspondences(figure.add_subplot(below[0]), view, drawing, fineness)
     draw_residuals(figure.add_subplot(below[1]), view)
@@ -115,7 +116,7 @@ def _stages(view: RegistrationView, drawing: Drawing) -> list[tuple[str, FloatAr
     if drawing.apart is None:
         before = "both clouds as their files give them"
     else:
-        before = f"centres {drawing.apart:,.6g} units apart in the files: drawn side by side"
+        before = f"centres {length(drawing.apart, view.unit or 'units', ',.6g')} apart in the files: drawn side by side"
     after = f"seen along the target's upright axes ({drawing.up_words})"
     if drawing.after is not None:
         after = f"dark: both clouds in one place  ·  {after}"
@@ -154,8 +155,8 @@ def _draw_header(figure: Figure, view: RegistrationView) -> None:
         )
 
 
-def _draw_sides(
-    figure: Figure, panels: list[Axes], drawing: Drawing, motion: FloatArray, fineness: float
+def draw_sides(
+    figure: Figure, panels: list[Axes], drawing: Drawing, motion: FloatArray, fineness: float, unit: str
 ) -> None:
     """The three sides of one stage, all at one scale."""
     source = transform_points(motion, drawing.source) @ drawing.axes.T
@@ -164,23 +165,24 @@ def _draw_sides(
     middle, extent = (low + high) / 2.0, np.maximum(high - low, 1e-9 * drawing.radius)
     panel = panels[0].get_window_extent()
     room = 0.94 * panel.width, 0.84 * panel.height
-    unit = max(  # cloud units per pixel
+    pixel = max(  # its size in cloud units
         max(extent[right] / room[0], extent[up] / room[1]) for right, up in SIDES.values()
     )
-    half = np.array([panel.width, panel.height]) * unit / 2.0
+    half = np.array([panel.width, panel.height]) * pixel / 2.0
     for axes, (title, (right, up)) in zip(panels, SIDES.items(), strict=True):
         frame(axes)
         center = middle[[right, up]] - (0.0, 0.09 * half[1])  # the scale bar stands below
         image = xray(
-            source[:, [right, up]], target[:, [right, up]], center, half, unit / fineness, drawing.spacing
+            source[:, [right, up]], target[:, [right, up]], center, half, pixel / fineness, drawing.spacing
         )
         show(axes, image, center, half)
         text = axes.text(0.015, 0.975, title, transform=axes.transAxes, va="top", fontsize=11, color=SOFT)
         text.set_bbox(LABEL_BOX)
-        draw_scale_bar(axes, half, center)
+        draw_scale_bar(axes, half, center, unit)
 
 
-def _draw_absent(panels: list[Axes], text: str) -> None:
+def draw_absent(panels: list[Axes], text: str) -> None:
+    """Empty panels, with words in the middle one."""
     for axes in panels:
         frame(axes)
         axes.set_facecolor("#f4f5f7")

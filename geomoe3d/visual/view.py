@@ -17,9 +17,10 @@ from geomoe3d.geometry.se3 import residuals
 from geomoe3d.types import BoolArray, FloatArray, IntArray, PointCloud
 
 if TYPE_CHECKING:
-    from geomoe3d.result import RegistrationResult
+    from geomoe3d.result import Alternative, RegistrationResult
 
 WEIGHT_THRESHOLD = 0.5
+_MATTERS = 1 / 3  # of the answer's score
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class RegistrationView:
             coloured by group instead of inlier or outlier.
         group_names: name of group 0, 1, ...; groups beyond it are called by their number.
         weight_threshold: a correspondence counts as kept where its weight is larger than this.
+        unit: name of the files' unit of length, such as "m"; empty where it is not known.
 
     Raises:
         InputError: shapes that do not fit together, or values outside their range.
@@ -53,6 +55,7 @@ class RegistrationView:
     groups: IntArray | None = None
     group_names: tuple[str, ...] = ()
     weight_threshold: float = WEIGHT_THRESHOLD
+    unit: str = ""
 
     @classmethod
     def of(
@@ -63,6 +66,7 @@ class RegistrationView:
         weights: FloatArray | None = None,
         groups: IntArray | None = None,
         group_names: tuple[str, ...] = (),
+        unit: str = "",
     ) -> RegistrationView:
         """From the clouds as loaded, source and target; groups only where more than one of them agrees."""
         if groups is not None and (weights is None or len(np.unique(groups[weights > WEIGHT_THRESHOLD])) < 2):
@@ -78,6 +82,7 @@ class RegistrationView:
             target_colors=target.colors,
             groups=groups,
             group_names=group_names,
+            unit=unit,
         )
 
     def __post_init__(self) -> None:
@@ -103,6 +108,14 @@ class RegistrationView:
     def has_transform(self) -> bool:
         """False where the registration failed without any hypothesis (the transform holds NaN)."""
         return bool(np.isfinite(self.result.T_target_source).all())
+
+    @property
+    def rival(self) -> Alternative | None:
+        """The alternative where it matters: the answer is ambiguous, or it does a third as well or better."""
+        other = self.result.alternative
+        if other is None or not np.isfinite(other.T_target_source).all():
+            return None
+        return other if self.result.status == "ambiguous" or other.relative_score >= _MATTERS else None
 
     def residuals(self) -> FloatArray:
         """(K,) distance of each moved source point to its target point, cloud units; NaN if no transform."""

@@ -112,7 +112,7 @@ def cloud_of(
     if "colors" in groups and colors is None:
         del groups["colors"]
     used = {k for chosen in groups.values() for k in chosen}
-    names = [name.strip().strip("\"'") for name in names]
+    names = [name.strip().strip("\"'") or f"column_{k}" for k, name in enumerate(names, 1)]
     fields: dict[str, NDArray[Any]] = {}
     for k, (name, column) in enumerate(zip(names, columns, strict=True)):
         if k not in used and name in fields:

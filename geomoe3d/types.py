@@ -62,6 +62,8 @@ class PreparedCloud:
         features: (n, D) float32 of length 1, of a descriptor, or None before it was asked.
         voxel_size: edge of the grid in cloud units.
         viewpoint: (3,) local position of the sensor, known or guessed, or None.
+        scanned: False for a part of a map: its viewpoint is then no sensor's but the place from which it is looked at,
+            and says nothing of what must be empty.
         origin: (3,) float64 shift as in `PointCloud`.
         name: what to call the cloud in messages.
         num_input: points given, before anything was dropped.
@@ -81,6 +83,7 @@ class PreparedCloud:
     num_non_finite: int = 0
     num_duplicates: int = 0
     num_isolated: int = 0
+    scanned: bool = True
 
     def __len__(self) -> int:
         return len(self.points)

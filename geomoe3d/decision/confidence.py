@@ -129,6 +129,8 @@ def measure_information(
 def _sensors_apart(T_target_source: FloatArray, source: PreparedCloud, target: PreparedCloud) -> float:
     """Distance in voxels of the sensors under a motion, or, if less, of the files' origins where both lie amid their
     clouds: a spinning sensor stood there, though the cloud may look as if it had been moved there."""
+    if not (source.scanned and target.scanned):
+        return np.inf
     origins = [-cloud.origin for cloud in (source, target)]
     places = [(source.viewpoint, target.viewpoint)]
     if all(

@@ -47,7 +47,8 @@ class Evidence:
         distinctiveness: mean over source points of (-ln p - 1) x (1 - (d / threshold)^2) for agreeing
             points and 0 for the others; about zero for chance overlap, larger is better.
         free_space_violation: share of source points in target's free space over those it could see, plus
-            the same with the roles exchanged; 0 where a viewpoint is neither known nor guessed.
+            the same with the roles exchanged; 0 where a viewpoint is neither known nor guessed. Of a part of a map,
+            which no sensor saw, only the share of its points in the scan's free space.
         surface_score: distinctiveness x exp(-10 free_space_violation), not below zero; its factor of the score.
     """
 
@@ -147,10 +148,14 @@ class Verifier:
         self._lift = _LIFT * np.arange(len(similarity))
         self._random_similarity = (np.sort(similarity, axis=1) + self._lift[:, None]).ravel()
         self._back = target.points[np.sort(rng.permutation(len(target))[:num_queries])]
-        self._source_view = self._target_view = None
-        if source.viewpoint is not None and target.viewpoint is not None:
-            self._source_view = RangeImage.of(source.points, source.viewpoint)
-            self._target_view = RangeImage.of(target.points, target.viewpoint)
+        self._signed = source.viewpoint is not None and target.viewpoint is not None
+        views = [
+            RangeImage.of(cloud.points, cloud.viewpoint)
+            if self._signed and cloud.viewpoint is not None and cloud.scanned
+            else None
+            for cloud in (source, target)
+        ]
+        self._source_view, self._target_view = views
 
     def evidence(self, T_target_source: FloatArray) -> Evidence:
         """What the clouds say of one transform (4, 4) in local coordinates."""
@@ -176,7 +181,7 @@ class Verifier:
         turned = (self._normals @ R.transpose(0, 2, 1)).reshape(-1, 3)[hit]
         cosine = np.einsum("ij,ij->i", turned, self._target.normals[nearest])
         # Without both sensor positions the normals' signs are a guess, and only their lines can be compared.
-        agrees = (cosine if self._target_view is not None else np.abs(cosine)) > _LEAST_COSINE
+        agrees = (cosine if self._signed else np.abs(cosine)) > _LEAST_COSINE
         # -ln p of a uniform p has mean 1, so chance overlap sums to zero.
         surprise = -np.log(self._chance(asked[agrees], nearest[agrees])) - 1
         surprise *= 1 - (distance[agrees] / self._threshold) ** 2
@@ -199,10 +204,10 @@ class Verifier:
 
     def _violations(self, R: FloatArray, t: FloatArray, moved: FloatArray) -> FloatArray:
         total = np.zeros(len(R))
-        if self._source_view is None or self._target_view is None:
-            return total
         back = (self._back - t) @ R
         for view, points in ((self._target_view, moved), (self._source_view, back)):
+            if view is None:
+                continue
             seen, margins = (
                 values.reshape(points.shape[:2]) for values in view.margins(points.reshape(-1, 3))
             )

@@ -1,0 +1,1 @@
+"""A large cloud described once, and small scans found in it."""

@@ -1,0 +1,136 @@
+"""A map on one grid: points with normals, and at every fourth of them what is compared with a scan.
+
+Scans of other sizes want other grids, so a map may hold several levels. FPFH of three reaches (`features.multiscale`)
+finds two to three times as many true matches in a whole room as FPFH does; its 99 numbers are brought to 32 by the
+map's own principal directions. 200 bytes and some 60 microseconds per point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geomoe3d.clouds.prepare import drop_isolated, estimate_normals, voxel_means
+from geomoe3d.config import PreparationConfig
+from geomoe3d.errors import EmptyCloudError
+from geomoe3d.features.base import with_features
+from geomoe3d.features.multiscale import MultiscaleDescriptor
+from geomoe3d.features.pyramid import one_per_voxel
+from geomoe3d.maps.facing import both_sides, facing_alike
+from geomoe3d.maps.voxels import VoxelSums
+from geomoe3d.types import BoolArray, Float32Array, FloatArray, IntArray, PreparedCloud
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+_SPACING = 2  # voxels between the points that are compared: an inlier may be two voxels off
+_DIRECTIONS = 32
+_SAMPLE = 20_000  # features from which the principal directions are found
+_KNOWN = 0.1  # length of a mean direction to the sensors below which they saw a surface from everywhere
+_LEAST = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """See the module; local coordinates of the map.
+
+    Attributes:
+        voxel_size: edge of the grid, cloud units.
+        points, normals: (n, 3); the normals face the sensors where these are known, else the way their neighbours do.
+        key_points, key_normals: (K, 3) what is compared; a point whose side is not known is there twice, once for
+            each.
+        key_features: (K, 32) float32 of about length 1, see `described`.
+        directions: (99, 32) principal directions of the features, orthonormal.
+    """
+
+    voxel_size: float
+    points: FloatArray
+    normals: FloatArray
+    key_points: FloatArray
+    key_normals: FloatArray
+    key_features: Float32Array
+    directions: Float32Array
+
+    @classmethod
+    def of(cls, voxels: VoxelSums, voxel_size: float, config: PreparationConfig, *, seed: int = 0) -> Level:
+        """Describe a map on one grid.
+
+        Args:
+            voxels: on a grid as fine or finer.
+            voxel_size: wanted edge.
+            config: neighbourhoods of the normals, in voxels.
+            seed: decides from which features the directions are found.
+
+        Raises:
+            EmptyCloudError: fewer than 3 points with neighbours remain.
+        """
+        radius = config.normal_radius * voxel_size
+        means = voxels.points
+        points = means if voxel_size <= voxels.edge else voxel_means(means, voxel_size)
+        points = drop_isolated(points, radius)
+        if len(points) < _LEAST:
+            raise EmptyCloudError(
+                f"{len(points)} points of the map remain on a {voxel_size:.4g} grid, at least {_LEAST} are needed; "
+                "give a denser map or a voxel size that fits it"
+            )
+        normals = estimate_normals(points, radius, config.normal_neighbors)
+        normals, known = _turned(points, normals, voxels)
+        bare = PreparedCloud(points, normals, None, voxel_size, None, voxels.origin)
+        features = with_features(bare, MultiscaleDescriptor()).features
+        assert features is not None
+        rows = one_per_voxel(bare, _SPACING)
+        features, unsure = features[rows], np.flatnonzero(~known[rows])
+        features = np.concatenate([features, both_sides(features[unsure])])
+        directions = _principal(features, seed)
+        return cls(
+            voxel_size,
+            points,
+            normals,
+            np.concatenate([points[rows], points[rows[unsure]]]),
+            np.concatenate([normals[rows], -normals[rows[unsure]]]),
+            np.ascontiguousarray(features @ directions),
+            directions,
+        )
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points)
+
+    def described(self, scan: PreparedCloud) -> tuple[IntArray, Float32Array]:
+        """Rows of a scan's points that are compared, as the map's, and their features (k, 32).
+
+        Args:
+            scan: on the level's grid, normals turned to its sensor.
+        """
+        features = with_features(scan, MultiscaleDescriptor()).features
+        assert features is not None
+        rows = one_per_voxel(scan, _SPACING)
+        return rows, np.ascontiguousarray(features[rows] @ self.directions)
+
+
+def _turned(points: FloatArray, normals: FloatArray, voxels: VoxelSums) -> tuple[FloatArray, BoolArray]:
+    """Normals turned to the sensors where these are known, and where that is."""
+    from scipy.spatial import cKDTree
+
+    if not voxels.towards.any():
+        return facing_alike(points, normals), np.zeros(len(points), dtype=np.bool_)
+    _, nearest = cKDTree(voxels.points).query(points)
+    towards = voxels.towards[nearest] / voxels.counts[nearest, None]
+    height = np.einsum("ij,ij->i", normals, towards)
+    known: BoolArray = np.abs(height) > _KNOWN
+    turned = normals * np.where(height < 0, -1.0, 1.0)[:, None]
+    return turned, known
+
+
+def _principal(features: Float32Array, seed: int) -> Float32Array:
+    """(D, 32) directions in which a sample of features is longest, about zero so that products stay products."""
+    rows = np.sort(np.random.default_rng(seed).permutation(len(features))[:_SAMPLE])
+    sample = features[rows].astype(np.float64)
+    _, vectors = np.linalg.eigh(sample.T @ sample)
+    return np.ascontiguousarray(vectors[:, ::-1][:, :_DIRECTIONS].astype(np.float32))

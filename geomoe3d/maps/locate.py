@@ -1,0 +1,197 @@
+"""One scan in a map: candidate places, the ordinary line at the best of them, one decision.
+
+A map has no sensor, so its surfaces have no front. Under a motion the scan's sensor has a place in the map, and what
+was matched was seen from there: the map around a candidate is cut out, turned to that place, described and compared
+like another scan. Before that a quick look tells good candidates from bad ones: a scan lies in its map with all of
+its surface, and nothing of the map may stand where the scan's sensor looked through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geomoe3d.clouds.pair import Pair
+from geomoe3d.clouds.prepare import orient_normals
+from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.decision.answer import Decision
+from geomoe3d.decision.confidence import judge, lead_over
+from geomoe3d.decision.scale import measure_scale
+from geomoe3d.decision.selection import Selection, are_different
+from geomoe3d.features.base import with_features
+from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.maps.level import Level
+from geomoe3d.maps.places import Query
+from geomoe3d.pipeline import Pipeline
+from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+
+_WINDOWS, _MORE_WINDOWS = 10, 40
+_PER_WINDOW = 6
+_ASKED, _ASKED_BACK = 400, 800
+_LEAST_COSINE = 0.7
+_VIOLATION_WEIGHT = 10.0
+_DISTINCT_THRESHOLDS = 3.0
+_CLOSE = 0.75  # of the best candidate's quick score: such places are looked at too
+_MARGIN = 10.0  # voxels around the scan's reach that are cut out with it: twice a feature's radius
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was decided at one place.
+
+    Attributes:
+        pair: the scan, and the map around the place.
+        decision: of the ordinary line there.
+    """
+
+    pair: Pair
+    decision: Decision
+
+
+class Search:
+    """Looks for one scan on one level of a map.
+
+    Args:
+        line: parts of the configuration.
+        scan: on the level's grid, with the features of the line.
+        level: of the map.
+        part: of what is cut out of the map: its name, origin and counts; its arrays are replaced.
+        clock: told of the stages.
+    """
+
+    def __init__(
+        self, line: Pipeline, scan: PreparedCloud, level: Level, part: PreparedCloud, clock: StageClock
+    ) -> None:
+        self._line, self._level, self._part, self._clock = line, level, part, clock
+        self.config: RegistrationConfig = line.config
+        self.scan = scan
+        self.center = scan.points.mean(0)
+        self.eye = self.center if scan.viewpoint is None else scan.viewpoint
+        reach = np.linalg.norm(scan.points - self.center, axis=1)
+        self.reach = float(np.quantile(reach, 0.98))
+        clock("places")
+        self._query = Query(scan, level, seed=self.config.seed)
+        rng = np.random.default_rng(self.config.seed)
+        self._rows = np.sort(rng.permutation(len(scan))[:_ASKED])
+        self._order = rng.permutation(len(level.points))
+        self._view = None if scan.viewpoint is None else RangeImage.of(scan.points, scan.viewpoint)
+
+    def candidates(
+        self, *, more: bool = False, near: tuple[FloatArray, float] | None = None, given: Sequence[FloatArray] = ()
+    ) -> list[tuple[float, Hypothesis]]:
+        """Distinct motions into the map with their quick scores, best first.
+
+        Args:
+            more: look into four times as many windows.
+            near: (3,) where the scan's sensor, or its middle where none is known, is said to be, local coordinates,
+                and how far off at most.
+            given: further motions (4, 4), local coordinates.
+        """
+        self._clock("places")
+        within = None if near is None else (near[0], near[1] + float(np.linalg.norm(self.eye - self.center)))
+        windows = self._query.windows(_MORE_WINDOWS if more else _WINDOWS, within)
+        self._clock("propose")
+        proposed = [h for window in windows for h in self._query.motions(window, _PER_WINDOW)]
+        if near is not None:
+            proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
+        proposed += [Hypothesis(T) for T in given]
+        scored = [(self._quick(h.T_target_source), h) for h in proposed]
+        scored.sort(key=lambda item: -item[0])
+        chosen: list[tuple[float, Hypothesis]] = []
+        for score, hypothesis in scored:
+            if all(self.differ(hypothesis, other) for _, other in chosen):
+                chosen.append((score, hypothesis))
+        return chosen
+
+    def differ(self, a: Hypothesis, b: Hypothesis) -> bool:
+        """Whether two motions are clearly different."""
+        shift = _DISTINCT_THRESHOLDS * self.config.estimator.inlier_threshold * self.scan.voxel_size
+        return are_different(a.T_target_source, b.T_target_source, self.scan, shift)
+
+    def look(self, hypothesis: Hypothesis) -> Found:
+        """The ordinary line on the scan and the map around where a motion puts it."""
+        with single_blas_thread():
+            T = hypothesis.T_target_source
+            target = self._around(T)
+            self._clock("match")
+            pair = self._line.match((self.scan, target), None, self._clock)
+            _, proposed = self._line.propose(pair, self._clock)
+            selection = Selection(pair, self._line.scorers, self._line.refiner, self.config, self._clock)
+            selection.add([Hypothesis(T), *proposed])
+            return Found(pair, selection.decide())
+
+    def decide(self, found: Sequence[Found]) -> tuple[Found, list[Hypothesis]]:
+        """The best of several places, judged beside all others, and the distinct answers of all, best first."""
+        answers = [(f, f.decision.answer) for f in found if f.decision.answer is not None]
+        if not answers:
+            return found[0], []
+        answers.sort(key=lambda item: -item[1].score)
+        best, answer = answers[0]
+        rivals = [h for f, own in answers for h in (own, f.decision.alternative) if h is not None]
+        rivals.sort(key=lambda h: -h.score)
+        distinct: list[Hypothesis] = [answer]
+        for h in rivals:
+            if all(self.differ(h, other) for other in distinct):
+                distinct.append(h)
+        rival = distinct[1] if len(distinct) > 1 else None
+        lead = lead_over(answer.score, None if rival is None else rival.score)
+        matched = best.pair.matched
+        support = float((best.decision.residuals(matched) < best.pair.inlier_threshold).mean()) if len(matched) else 0.0
+        information = best.decision.information
+        judgement = judge(answer, rival, lead, support, information, self.config.decision, len(matched))
+        decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
+        if answer.note is not None:
+            decision = decision.with_note(answer.note)
+        self._clock("decide")
+        decision = decision.with_scale(measure_scale(decision.T_target_source, *best.pair.clouds))
+        return Found(best.pair, decision), distinct
+
+    def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
+        return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]
+
+    def _quick(self, T: FloatArray) -> float:
+        """Share of the scan's points that lie on the map with an agreeing plane, times exp(-10 v), v the share of map
+        points that stand where the scan's sensor looked through."""
+        level, voxel = self._level, self._level.voxel_size
+        moved = transform_points(T, self.scan.points[self._rows])
+        distance, nearest = level.tree.query(moved, distance_upper_bound=2 * voxel)
+        hit = np.isfinite(distance)
+        normals = self.scan.normals[self._rows][hit] @ T[:3, :3].T
+        cosine = np.abs(np.einsum("ij,ij->i", normals, level.normals[np.asarray(nearest)[hit]]))
+        agreement = float((cosine > _LEAST_COSINE).sum() / len(moved))
+        if self._view is None or not hit.any():
+            return agreement
+        around = np.array(level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach))
+        around = around[np.argsort(self._order[around])[:_ASKED_BACK]]
+        if not len(around):
+            return 0.0
+        seen, margin = self._view.margins(transform_points(inverse(T), level.points[around]))
+        violation = float((margin < -4 * voxel).sum() / (seen.sum() + 0.05 * len(around)))
+        return agreement * float(np.exp(-_VIOLATION_WEIGHT * violation))
+
+    def _around(self, T: FloatArray) -> PreparedCloud:
+        """What the map holds within the scan's reach, turned to where the motion puts the scan's sensor."""
+        level = self._level
+        center, eye = transform_points(T, np.stack([self.center, self.eye]))
+        rows = level.tree.query_ball_point(center, self.reach + _MARGIN * level.voxel_size, return_sorted=True)
+        points = level.points[rows]
+        part = replace(
+            self._part,
+            points=points,
+            normals=orient_normals(points, level.normals[rows], eye),
+            viewpoint=None if self.scan.viewpoint is None else eye,
+        )
+        self._clock("features")
+        return with_features(part, self._line.descriptor)
+
+
+def likely(candidates: Sequence[tuple[float, Hypothesis]], most: int) -> Iterator[Hypothesis]:
+    """The best candidate, and those that come near it, at most so many."""
+    for score, hypothesis in candidates[:most]:
+        if score >= _CLOSE * candidates[0][0]:
+            yield hypothesis

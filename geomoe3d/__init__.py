@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         NonFiniteError,
         OutputError,
     )
+    from geomoe3d.maps.map import Location, Map, Place
     from geomoe3d.multiway.run import register_scans
     from geomoe3d.registration import Registrar, register
     from geomoe3d.result import RegistrationResult
@@ -54,11 +55,14 @@ __all__ = [
     "FormatError",
     "GeoMoE3DError",
     "InputError",
+    "Location",
+    "Map",
     "MissingConfigError",
     "MissingFileError",
     "MissingWeightsError",
     "NonFiniteError",
     "OutputError",
+    "Place",
     "PointCloud",
     "Registrar",
     "RegistrationConfig",
@@ -78,6 +82,9 @@ _HOME = {
     "register": "registration",
     "register_correspondences": "correspondence_registration",
     "CorrespondenceResult": "correspondence_registration",
+    "Location": "maps.map",
+    "Map": "maps.map",
+    "Place": "maps.map",
     "register_pairs": "batch.run",
     "register_scans": "multiway.run",
     "RegistrationResult": "result",

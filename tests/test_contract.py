@@ -286,6 +286,7 @@ ORDER = [
     {"refinement"},
     {"decision"},
     {"pipeline"},
+    {"maps"},
     {"correspondence_registration"},
     {"registration"},
     {"evaluation", "training", "batch", "multiway"},

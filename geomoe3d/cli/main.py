@@ -15,7 +15,19 @@ import click
 from geomoe3d import __version__
 from geomoe3d.cli.errors import HELP, run
 
-VERBS = ("register", "batch", "multiway", "evaluate", "train", "data", "sample", "config", "doctor")
+VERBS = (
+    "register",
+    "batch",
+    "multiway",
+    "index",
+    "locate",
+    "evaluate",
+    "train",
+    "data",
+    "sample",
+    "config",
+    "doctor",
+)
 """In the order of the help; each has its file ``geomoe3d/cli/<verb>.py`` with a ``command``."""
 
 

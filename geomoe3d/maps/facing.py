@@ -49,4 +49,5 @@ def both_sides(features: Float32Array) -> Float32Array:
     """
     blocks = features.reshape(len(features), -1, 3, _BINS).copy()
     blocks[:, :, [0, 2]] = blocks[:, :, [0, 2], ::-1]
-    return blocks.reshape(features.shape)
+    turned: Float32Array = blocks.reshape(features.shape)
+    return turned

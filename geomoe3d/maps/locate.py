@@ -82,7 +82,11 @@ class Search:
         self._view = None if scan.viewpoint is None else RangeImage.of(scan.points, scan.viewpoint)
 
     def candidates(
-        self, *, more: bool = False, near: tuple[FloatArray, float] | None = None, given: Sequence[FloatArray] = ()
+        self,
+        *,
+        more: bool = False,
+        near: tuple[FloatArray, float] | None = None,
+        given: Sequence[FloatArray] = (),
     ) -> list[tuple[float, Hypothesis]]:
         """Distinct motions into the map with their quick scores, best first.
 
@@ -141,7 +145,11 @@ class Search:
         rival = distinct[1] if len(distinct) > 1 else None
         lead = lead_over(answer.score, None if rival is None else rival.score)
         matched = best.pair.matched
-        support = float((best.decision.residuals(matched) < best.pair.inlier_threshold).mean()) if len(matched) else 0.0
+        support = (
+            float((best.decision.residuals(matched) < best.pair.inlier_threshold).mean())
+            if len(matched)
+            else 0.0
+        )
         information = best.decision.information
         judgement = judge(answer, rival, lead, support, information, self.config.decision, len(matched))
         decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
@@ -178,7 +186,9 @@ class Search:
         """What the map holds within the scan's reach, turned to where the motion puts the scan's sensor."""
         level = self._level
         center, eye = transform_points(T, np.stack([self.center, self.eye]))
-        rows = level.tree.query_ball_point(center, self.reach + _MARGIN * level.voxel_size, return_sorted=True)
+        rows = level.tree.query_ball_point(
+            center, self.reach + _MARGIN * level.voxel_size, return_sorted=True
+        )
         points = level.points[rows]
         part = replace(
             self._part,

@@ -16,7 +16,15 @@ from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.maps.level import Level
 from geomoe3d.runtime.threads import each, single_blas_thread
-from geomoe3d.types import BoolArray, Correspondences, Float32Array, FloatArray, Hypothesis, IntArray, PreparedCloud
+from geomoe3d.types import (
+    BoolArray,
+    Correspondences,
+    Float32Array,
+    FloatArray,
+    Hypothesis,
+    IntArray,
+    PreparedCloud,
+)
 
 _ASKED = 1000  # points of the scan
 _MATCHES = 500  # of a window, from which motions are proposed

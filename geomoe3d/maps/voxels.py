@@ -43,7 +43,9 @@ class VoxelSums:
     def empty(cls, edge: float, origin: FloatArray) -> VoxelSums:
         """Nothing yet."""
         none = np.zeros(0, dtype=np.int64)
-        return cls(float(edge), np.asarray(origin, dtype=np.float64), none, np.zeros((0, 3)), none, np.zeros((0, 3)))
+        return cls(
+            float(edge), np.asarray(origin, dtype=np.float64), none, np.zeros((0, 3)), none, np.zeros((0, 3))
+        )
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -93,7 +95,12 @@ class VoxelSums:
         return self.keys, self.sums, self.counts, self.towards
 
     def _of(
-        self, keys: IntArray, sums: FloatArray, counts: IntArray, towards: FloatArray, edge: float | None = None
+        self,
+        keys: IntArray,
+        sums: FloatArray,
+        counts: IntArray,
+        towards: FloatArray,
+        edge: float | None = None,
     ) -> VoxelSums:
         return VoxelSums(self.edge if edge is None else edge, self.origin, keys, sums, counts, towards)
 
@@ -106,7 +113,9 @@ def _packed(cells: IntArray) -> IntArray:
 
 def _cells(keys: IntArray) -> IntArray:
     mask = 2**_BITS - 1
-    return np.stack([(keys >> 2 * _BITS) & mask, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF
+    mixed = [(keys >> 2 * _BITS) & mask, (keys >> _BITS) & mask, keys & mask]
+    cells: IntArray = np.stack(mixed, axis=1) - _HALF
+    return cells
 
 
 Columns = tuple[IntArray, FloatArray, IntArray, FloatArray]

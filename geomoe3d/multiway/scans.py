@@ -53,12 +53,24 @@ def as_paths(
 
 
 def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
-    """The scans of given files and folders, in natural order (scan 2 before scan 10) within each folder.
+    """The scans of a model, see `find_clouds`.
+
+    Raises:
+        InputError: as `find_clouds`, or fewer than two.
+    """
+    scans = find_clouds(inputs)
+    if len(scans) < 2:
+        raise InputError(f"a model needs at least 2 scans, found {len(scans)}")
+    return scans
+
+
+def find_clouds(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
+    """The clouds of given files and folders, in natural order (scan 2 before scan 10) within each folder.
 
     A folder stands for all files in it that can be read as clouds, not for its sub-folders.
 
     Raises:
-        InputError: a path that is not there, a folder without clouds, a file given twice, or fewer than two.
+        InputError: a path that is not there, a folder without clouds, or a file given twice.
     """
     paths: list[Path] = []
     for given in inputs:
@@ -76,8 +88,6 @@ def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
     twice = {path for path in resolved if resolved.count(path) > 1}
     if twice:
         raise InputError(f"'{sorted(twice)[0]}' is given more than once; name every scan once")
-    if len(resolved) < 2:
-        raise InputError(f"a model needs at least 2 scans, found {len(resolved)}")
     return [Scan(name, str(path)) for name, path in zip(_unique_names(resolved), resolved, strict=True)]
 
 

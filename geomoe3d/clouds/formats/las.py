@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,7 +15,8 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors, wrong_count
 from geomoe3d.clouds.formats.registry import reader, writer
-from geomoe3d.errors import DependencyError, FormatError
+from geomoe3d.errors import DependencyError, FormatError, InputError
+from geomoe3d.types import FloatArray
 
 _POINTS_PER_BYTE = 100  # far more than any compression gives, of points that differ
 _LARGEST = 2_000_000_000  # of the signed 32 bit integers that LAS stores, with a margin
@@ -49,22 +52,47 @@ def read_las(path: Path) -> RawCloud:
         FormatError: no LAS file, damaged, or a count in the header that the content does not bear out.
         DependencyError: laspy (or lazrs for LAZ) is absent.
     """
+    with _opened(path) as reader:
+        las = reader.read()
+        if len(las.points) != reader.header.point_count:
+            raise wrong_count(path, reader.header.point_count, len(las.points))
+        rest = _held(path, reader.header) - len(las.points)
+        note = f"the header says {len(las.points)} points, the file holds {len(las.points) + rest}; "
+        notes = (f"{note}the rest is left out, as PDAL does",) if rest > 0 else ()
+        return replace(_cloud(las), notes=notes)
+
+
+def read_pieces(path: Path, size: int) -> Iterator[FloatArray]:
+    """The coordinates (n, 3) of a file as `read_las` gives them, at most ``size`` points at a time.
+
+    Raises:
+        FormatError, DependencyError: as `read_las`, in the course of reading.
+    """
+    with _opened(path) as reader:
+        count = 0
+        for some in reader.chunk_iterator(size):
+            points = np.empty((len(some), 3))
+            for k, axis in enumerate((some.x, some.y, some.z)):
+                points[:, k] = axis
+            count += len(points)
+            yield points
+        if count != reader.header.point_count:
+            raise wrong_count(path, reader.header.point_count, count)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """laspy's reader of a file whose header was held against its size; what it raises becomes `FormatError`."""
     laspy = require_laspy(path.suffix.lower() == ".laz")
     _check_records(path)
     try:
         with laspy.open(path) as reader:
             _check_size(path, reader.header)
-            las = reader.read()
-            if len(las.points) != reader.header.point_count:
-                raise wrong_count(path, reader.header.point_count, len(las.points))
-            rest = _held(path, reader.header) - len(las.points)
-            note = f"the header says {len(las.points)} points, the file holds {len(las.points) + rest}; "
-            notes = (f"{note}the rest is left out, as PDAL does",) if rest > 0 else ()
-            return replace(_cloud(las), notes=notes)
-    except (FormatError, PermissionError):
+            yield reader
+    except (InputError, PermissionError):
         raise
     except BaseException as error:  # lazrs may panic on damaged data, which is no Exception
-        if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError)):
+        if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError, GeneratorExit)):
             raise
         raise FormatError(f"'{path}' is no LAS file or damaged: {error}") from None
 

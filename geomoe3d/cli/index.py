@@ -1,0 +1,79 @@
+"""``geomoe3d index``: a large cloud described once, so that scans are found in it quickly."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from geomoe3d.cli.errors import HELP, traceback_option
+from geomoe3d.cli.files import part_option
+from geomoe3d.cli.parts import configuration_options
+
+if TYPE_CHECKING:
+    from geomoe3d.config import RegistrationConfig
+
+_KEPT_EVERY = 60.0  # seconds after which what was read so far is written
+
+
+@click.command(context_settings=HELP, short_help="Describe a large cloud once, to find scans in it.")
+@click.argument("inputs", metavar="CLOUDS... OUT.map", nargs=-1, required=True)
+@click.option(
+    "--poses",
+    metavar="FILE",
+    help="Where each cloud lies in the map (TUM, KITTI or JSON, in their order). [they lie as they are]",
+)
+@configuration_options
+@click.option("--fresh", is_flag=True, help="Begin anew where OUT.map exists; else clouds are added to it.")
+@click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@part_option("reader")
+@traceback_option
+def command(
+    inputs: tuple[str, ...], poses: str | None, config: RegistrationConfig, fresh: bool, quiet: bool
+) -> None:
+    """Describe CLOUDS (files, or folders of them), one map together, in the file OUT.map.
+
+    `geomoe3d locate` finds scans in it. Called again with more clouds, or after an interruption, it reads only those
+    that are not in it yet. LAS and LAZ are read in pieces. With --poses the clouds are taken for scans, whose sensors
+    stood where `register` believes them to have stood.
+    """
+    if len(inputs) < 2:
+        raise click.UsageError("give at least one cloud, and OUT.map last")
+    from geomoe3d.cli.progress import stage_display, stdout_to_stderr
+
+    with stdout_to_stderr(), stage_display(quiet) as stage:
+        stage("start")
+        from geomoe3d.clouds.io import load_points
+        from geomoe3d.clouds.viewpoint import find_viewpoints
+        from geomoe3d.maps.map import Map
+        from geomoe3d.multiway.initial import read_poses
+        from geomoe3d.multiway.scans import find_clouds
+        from geomoe3d.runtime.files import check_output
+
+        out = check_output(inputs[-1], force=True)
+        scans = find_clouds(inputs[:-1])
+        where = None if poses is None else read_poses(poses, [scan.name for scan in scans])
+        made = Map.open(out, config=config) if out.exists() and not fresh else Map.empty(config=config)
+        before, kept = made.sources, time.monotonic()
+        for number, scan in enumerate(scans):
+            stage(f"read {Path(scan.path).name}")
+            if where is None:
+                made = made.with_cloud(scan.path)
+            else:
+                cloud = load_points(scan.path)
+                view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
+                sensor = None if view is None else view + cloud.origin
+                made = made.with_cloud(scan.path, T_map_cloud=where[number], sensor=sensor)
+            if time.monotonic() - kept > _KEPT_EVERY:
+                made.save(out, force=True)
+                kept = time.monotonic()
+        made.describe(progress=stage)
+        stage("write")
+        made.save(out, force=True)
+    if not quiet:
+        added = len(made.sources) - len(before)
+        sizes = ", ".join(f"{size:.4g}" for size in made.voxel_sizes)
+        what = f"{made.num_points:,} points of {len(made.sources)} clouds ({added} new)"
+        click.echo(f"{out}: {what}, described on a grid of {sizes}")

@@ -1,0 +1,151 @@
+"""``geomoe3d locate``: where scans lie in a map, and how sure that is."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from geomoe3d.cli.errors import BAD_INPUT, HELP, NOT_SURE, OK, traceback_option
+from geomoe3d.cli.files import part_option
+from geomoe3d.cli.parts import configuration_options
+
+if TYPE_CHECKING:
+    from geomoe3d.config import RegistrationConfig
+    from geomoe3d.maps.map import Location
+
+
+@click.command(context_settings=HELP, short_help="Find scans in a map, and say how sure.")
+@click.argument("inputs", metavar="SCANS... MAP", nargs=-1, required=True)
+@configuration_options
+@click.option(
+    "-k", "--places", type=click.IntRange(1), default=3, show_default=True, help="Places named at most."
+)
+@click.option("--near", metavar="X,Y,Z", help="Where the sensor is believed to be, in the map's coordinates.")
+@click.option("--within", type=float, metavar="LENGTH", help="How far off that may be.")
+@click.option(
+    "--initial", metavar="FILE", help="A first guess of the motion, as of `register`; one scan only."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per scan and nothing else.")
+@click.option(
+    "--output", metavar="FILE.tum", help="Write the poses that are ok as TUM text, one line per scan."
+)
+@click.option("--force", is_flag=True, help="Replace an output file that exists.")
+@click.option("--quiet", is_flag=True, help="No progress.")
+@part_option("reader")
+@traceback_option
+@click.pass_context
+def command(
+    context: click.Context,
+    inputs: tuple[str, ...],
+    config: RegistrationConfig,
+    places: int,
+    near: str | None,
+    within: float | None,
+    initial: str | None,
+    as_json: bool,
+    output: str | None,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Find SCANS (files, or folders of them) in MAP: p_map = R p_scan + t.
+
+    MAP is what `geomoe3d index` wrote, or a cloud, which is then described first. Exit code 0 if all are ok, 3 if
+    not, 2 for unusable input. A place that is given by --near is looked at first and checked, not trusted.
+    """
+    if len(inputs) < 2:
+        raise click.UsageError("give at least one scan, and the map last")
+    from geomoe3d.cli.progress import stage_display, stdout_to_stderr
+
+    with stdout_to_stderr(), stage_display(quiet) as stage:
+        stage("start")
+        from geomoe3d.clouds.transform_files import load_transform
+        from geomoe3d.errors import InputError
+        from geomoe3d.maps.map import Map
+        from geomoe3d.multiway.scans import find_clouds
+        from geomoe3d.runtime.files import check_output
+
+        if output is not None:
+            check_output(output, force=force)
+        scans = find_clouds(inputs[:-1])
+        if initial is not None and len(scans) > 1:
+            raise click.UsageError(f"--initial is a guess of one scan, found {len(scans)}")
+        guess = None if initial is None else load_transform(initial)
+        prior = None if near is None else _numbers(near)
+        if Path(inputs[-1]).suffix.lower() == ".map":
+            within_map = Map.open(inputs[-1], config=config)
+        else:
+            within_map = Map.from_cloud(inputs[-1], config=config, progress=stage)
+    found: list[tuple[str, Location | None]] = []
+    begin = time.monotonic()
+    for scan in scans:
+        try:
+            with stdout_to_stderr(), stage_display(quiet) as stage:
+                location = within_map.locate(
+                    scan.path, k=places, near=prior, within=within, initial=guess, progress=stage
+                )
+        except InputError as error:
+            if len(scans) == 1:
+                raise
+            click.echo(f"{scan.name}: {error}", err=True)
+            location = None
+        found.append((scan.name, location))
+        _print(scan.name, location, as_json, len(scans) == 1)
+    if len(scans) > 1 and not as_json:
+        sure = sum(location is not None and location.ok for _, location in found)
+        rate = len(scans) / max(time.monotonic() - begin, 1e-9)
+        click.echo(f"{sure} of {len(scans)} ok; {rate:.2f} scans per second")
+    if output is not None:
+        _write(output, found, force)
+    if any(location is None for _, location in found):
+        context.exit(BAD_INPUT)
+    context.exit(OK if all(location is not None and location.ok for _, location in found) else NOT_SURE)
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3:
+        raise click.UsageError(f"--near is '{text}', expected X,Y,Z: three numbers with commas between")
+    return numbers
+
+
+def _print(name: str, location: Location | None, as_json: bool, alone: bool) -> None:
+    if location is None:
+        return
+    if as_json:
+        click.echo(json.dumps({"scan": name, **json.loads(location.to_json(None))}))
+        return
+    if not alone:
+        place = " ".join(f"{value:.6g}" for value in location.T_map_scan[:3, 3])
+        reason = f"; {location.result.reasons[0]}" if location.result.reasons else ""
+        click.echo(
+            f"{name}: {location.status} (confidence {location.result.confidence:.2f}) at {place}{reason}"
+        )
+        return
+    from geomoe3d.cli.summary import summary
+
+    click.echo(summary(location.result), color=False if os.environ.get("NO_COLOR") else None)
+    for number, place_found in enumerate(location.places[1:], start=2):
+        at = " ".join(f"{value:.6g}" for value in place_found.T_map_scan[:3, 3])
+        click.echo(f"place {number}: at {at}, {100 * place_found.relative_score:.0f} % of the score")
+
+
+def _write(path: str, found: Sequence[tuple[str, Location | None]], force: bool) -> None:
+    """Poses of the scans that are ok, and a remark for each of the others."""
+    from geomoe3d.multiway.formats import tum_text
+    from geomoe3d.runtime.files import write_text
+
+    sure = [(name, number, x.T_map_scan) for number, (name, x) in enumerate(found) if x is not None and x.ok]
+    text = tum_text([name for name, _, _ in sure], [n for _, n, _ in sure], [T for _, _, T in sure])
+    for number, (name, location) in enumerate(found):
+        if location is None or not location.ok:
+            text += f"# {number} {' '.join(name.split())}: {'unusable' if location is None else location.status}\n"
+    write_text(path, text, force=force)

@@ -1,0 +1,116 @@
+"""A map as one file: what it is made of, its voxels and its levels, with a hash of all of it.
+
+An uncompressed NumPy archive. Some 60 MB for 500,000 voxels with one level; read in a tenth of a second.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomoe3d.errors import FormatError, MissingFileError, cannot_read
+from geomoe3d.maps.level import Level
+from geomoe3d.maps.voxels import VoxelSums
+from geomoe3d.runtime.files import write_atomically
+
+VERSION = 1
+_LEVEL = tuple(field.name for field in fields(Level) if field.name != "voxel_size")
+_VOXELS = ("origin", "keys", "sums", "counts", "towards")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One cloud that a map was made of.
+
+    Attributes:
+        name: of its file, or what the caller called it.
+        sha256: of the file, or of its points.
+        num_points: finite points of it in the map.
+    """
+
+    name: str
+    sha256: str
+    num_points: int
+
+
+def save(
+    path: str | os.PathLike[str],
+    sources: tuple[Source, ...],
+    voxels: VoxelSums,
+    levels: tuple[Level, ...],
+    *,
+    force: bool,
+) -> None:
+    """Write a map; see `geomoe3d.maps.map.Map.save`."""
+    arrays: dict[str, NDArray[Any]] = {name: getattr(voxels, name) for name in _VOXELS}
+    for number, level in enumerate(levels):
+        arrays |= {f"level{number}_{name}": getattr(level, name) for name in _LEVEL}
+    told = {
+        "geomoe3d map": VERSION,
+        "edge": voxels.edge,
+        "levels": [level.voxel_size for level in levels],
+        "sources": [asdict(source) for source in sources],
+        "sha256": _hash(arrays),
+    }
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as handle:  # of a name, numpy would make another one
+            np.savez(handle, told=np.array(json.dumps(told)), allow_pickle=False, **arrays)
+
+    write_atomically(path, write, force=force)
+
+
+def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, tuple[Level, ...]]:
+    """Read a map.
+
+    Raises:
+        MissingFileError, ForbiddenFileError, InputError: no such file, or it may not be read.
+        FormatError: no map, of a later version, or damaged.
+    """
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            told = json.loads(str(archive["told"]))
+            if told["geomoe3d map"] > VERSION:
+                raise FormatError(
+                    f"'{path}' was written by a later version of geomoe3d (map version {told['geomoe3d map']}, known "
+                    f"is {VERSION}); update geomoe3d, or index the map again"
+                )
+            arrays = {name: archive[name] for name in archive.files if name != "told"}
+            voxels = VoxelSums(float(told["edge"]), *(arrays[name] for name in _VOXELS))
+            levels = tuple(
+                Level(float(size), **{name: arrays[f"level{number}_{name}"] for name in _LEVEL})
+                for number, size in enumerate(told["levels"])
+            )
+            sources = tuple(Source(**source) for source in told["sources"])
+            if _hash(arrays) != told["sha256"]:
+                raise FormatError(
+                    f"'{path}' is damaged: its content does not match its hash; index the map again"
+                )
+            return sources, voxels, levels
+    except FileNotFoundError:
+        raise MissingFileError(f"there is no map '{path}'; make one: geomoe3d index CLOUD {path}") from None
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise FormatError(
+            f"'{path}' is no map of geomoe3d or damaged ({error}); make one: geomoe3d index CLOUD OUT.map"
+        ) from None
+    except OSError as error:
+        raise cannot_read(error, f"cannot read the map '{path}': {error.strerror or error}") from None
+
+
+def _hash(arrays: Mapping[str, NDArray[Any]]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {values.dtype} {values.shape}".encode())
+        digest.update(values.data)
+    return digest.hexdigest()

@@ -1,0 +1,248 @@
+"""A map and scans in it: right places with their true poses, twins, strangers, and files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from generated_buildings import GRID, first_room, other_room, scanned, view
+
+import geomoe3d
+from geomoe3d import Map
+from geomoe3d.cli.errors import BAD_INPUT, OK, run
+from geomoe3d.cli.main import geomoe3d as program
+from geomoe3d.clouds.prepare import voxel_means
+from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
+from geomoe3d.features.base import with_features
+from geomoe3d.features.multiscale import MultiscaleDescriptor
+from geomoe3d.maps.facing import both_sides, facing_alike
+from geomoe3d.maps.pieces import pieces
+from geomoe3d.maps.voxels import VoxelSums
+from geomoe3d.types import PreparedCloud
+
+UTM = np.array([583394.0, 5283100.0, 498.0])
+AWAY = np.array([7.0, 1.0, 0.0])
+
+
+def shift(T, true):
+    return float(np.linalg.norm(T[:3, 3] - true[:3, 3]))
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """Two rooms that have nothing in common."""
+    return first_room(), other_room(np.random.default_rng(3))
+
+
+@pytest.fixture(scope="module")
+def building(rooms):
+    """Both at map coordinates, as one cloud without sensors."""
+    first, other = rooms
+    return np.concatenate([scanned(first, UTM, 1), scanned(other, UTM + AWAY, 2)])
+
+
+@pytest.fixture(scope="module")
+def house(building):
+    return Map.from_cloud(building, voxel_size=GRID)
+
+
+@pytest.fixture(scope="module")
+def scan(rooms):
+    return view(rooms[0], UTM, 5)
+
+
+# ---- finding -------------------------------------------------------------------------------------------
+
+
+def test_a_scan_is_found_in_its_room(house, scan):
+    points, true = scan
+    found = house.locate(points)
+    assert found.ok
+    assert shift(found.T_map_scan, true) < 0.05
+    np.testing.assert_allclose(found.T_map_scan[:3, :3], true[:3, :3], atol=0.02)
+    np.testing.assert_array_equal(found.places[0].T_map_scan, found.T_map_scan)
+    assert json.loads(found.to_json())["places"][0]["T_map_scan"] == found.T_map_scan.tolist()
+
+
+def test_of_two_alike_rooms_neither_is_ok_and_both_are_named(rooms, scan):
+    points, true = scan
+    room = scanned(rooms[0], UTM, 1)
+    found = Map.from_cloud(np.concatenate([room, room + AWAY]), voxel_size=GRID).locate(points)
+    assert found.status == "ambiguous"
+    twin = true.copy()
+    twin[:3, 3] += AWAY
+    off = [min(shift(place.T_map_scan, T) for place in found.places[:2]) for T in (true, twin)]
+    assert max(off) < 0.1
+
+
+def test_a_scan_of_another_building_is_not_ok(rooms, scan):
+    assert not Map.from_cloud(scanned(rooms[1], UTM, 2), voxel_size=GRID).locate(scan[0]).ok
+
+
+def test_a_place_that_is_given_is_looked_at_and_not_trusted(house, scan):
+    points, true = scan
+    assert house.locate(points, near=true[:3, 3], within=1.0).ok
+    elsewhere = house.locate(points, near=true[:3, 3] + AWAY, within=1.0)
+    assert shift(elsewhere.T_map_scan, true) < 0.05
+    assert any("the place that was given is not the answer" in reason for reason in elsewhere.result.reasons)
+
+
+# ---- making and keeping --------------------------------------------------------------------------------
+
+
+def test_a_map_read_again_answers_the_same(house, scan, tmp_path):
+    path = tmp_path / "house.map"
+    house.save(path)
+    again = Map.open(path, voxel_size=GRID).locate(scan[0])
+    direct = house.locate(scan[0])
+    np.testing.assert_array_equal(again.T_map_scan, direct.T_map_scan)
+    assert (again.status, again.result.confidence) == (direct.status, direct.result.confidence)
+    with pytest.raises(OutputError, match="exists"):
+        house.save(path)
+
+
+def test_a_room_added_later_is_found(rooms, scan, house):
+    first, other = rooms
+    made = Map.from_cloud(scanned(other, UTM + AWAY, 2), voxel_size=GRID).with_cloud(scanned(first, UTM, 1))
+    assert len(made.sources) == 2
+    assert made.num_points == house.num_points
+    found = made.locate(scan[0])
+    assert found.ok
+    assert shift(found.T_map_scan, scan[1]) < 0.05
+    assert made.with_cloud(scanned(first, UTM, 1)) is made  # it is in already
+
+
+def test_a_scan_is_added_by_its_pose_with_what_its_sensor_saw(rooms):
+    points, true = view(rooms[0], UTM, 9)
+    made = Map.empty(voxel_size=GRID).with_cloud(points, T_map_cloud=true, sensor=np.zeros(3))
+    towards = made._voxels.towards / np.linalg.norm(made._voxels.towards, axis=1, keepdims=True)
+    expected = true[:3, 3] - made._voxels.origin - made._voxels.points
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    assert np.median(np.einsum("ij,ij->i", towards, expected)) > 0.999
+
+
+# ---- what cannot be ------------------------------------------------------------------------------------
+
+
+def test_bad_input_is_refused_with_what_to_do(house, scan, tmp_path):
+    with pytest.raises(InputError, match="belong together"):
+        house.locate(scan[0], near=(0, 0, 0))
+    with pytest.raises(InputError, match="three finite numbers"):
+        house.locate(scan[0], near=(0, np.nan, 0), within=1.0)
+    with pytest.raises(InputError, match="k is 0"):
+        house.locate(scan[0], k=0)
+    with pytest.raises(EmptyCloudError, match="add a cloud first"):
+        Map.empty().locate(scan[0])
+    with pytest.raises(MissingFileError, match="geomoe3d index"):
+        Map.open(tmp_path / "none.map")
+    broken = tmp_path / "broken.map"
+    broken.write_bytes(b"nothing of the kind")
+    with pytest.raises(FormatError, match="no map of geomoe3d"):
+        Map.open(broken)
+
+
+def test_a_changed_file_is_damaged(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (500, 3)) * (4, 4, 0)
+    made = Map.empty(voxel_size=0.5).with_cloud(points)
+    path = tmp_path / "plane.map"
+    made.save(path)
+    content = dict(np.load(path))
+    content["sums"][0, 0] += 1.0
+    with path.open("wb") as handle:
+        np.savez(handle, **content)
+    with pytest.raises(FormatError, match="does not match its hash"):
+        Map.open(path)
+
+
+def test_units_and_sizes_that_cannot_be_fail_with_the_reason(house, scan):
+    larger = house.locate(1000.0 * scan[0])
+    assert larger.status == "failed"
+    assert "larger than the map" in larger.result.reasons[0]
+    assert np.isnan(larger.T_map_scan).all()
+    smaller = house.locate(0.001 * scan[0])
+    assert smaller.status == "failed"
+    assert "too coarse" in smaller.result.reasons[0]
+
+
+# ---- the parts -----------------------------------------------------------------------------------------
+
+
+def test_voxels_are_those_of_the_whole_in_whatever_pieces():
+    points = np.random.default_rng(1).uniform(-3, 3, (3000, 3))
+    whole = VoxelSums.empty(0.5, np.zeros(3)).added(points)
+    pieces = VoxelSums.empty(0.5, np.zeros(3))
+    for part in np.array_split(points, 7):
+        pieces = pieces.added(part)
+    np.testing.assert_array_equal(pieces.keys, whole.keys)
+    np.testing.assert_allclose(pieces.points, whole.points, atol=1e-12)
+    np.testing.assert_allclose(whole.points, voxel_means(points, 0.5), atol=1e-12)
+    coarse = VoxelSums.empty(1.0, np.zeros(3)).added(points)
+    np.testing.assert_array_equal(whole.coarser().keys, coarse.keys)
+    np.testing.assert_allclose(whole.coarser().points, coarse.points, atol=1e-12)
+
+
+def test_signs_run_along_a_sphere():
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    flipped = points * rng.choice([-1.0, 1.0], (2000, 1))
+    outward = np.einsum("ij,ij->i", facing_alike(points, flipped), points) > 0
+    assert outward.all() or not outward.any()
+
+
+def test_both_sides_are_the_features_of_turned_normals():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(0, 1, (800, 3)) * (3, 3, 0.3)
+    normals = rng.normal(size=(800, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def features(signed):
+        cloud = PreparedCloud(points, signed, None, 0.1, None, np.zeros(3))
+        return with_features(cloud, MultiscaleDescriptor()).features
+
+    # The histograms count pairs in bins; one at a bin's edge may fall to either side.
+    off = np.abs(both_sides(features(normals)) - features(-normals)).max(axis=1)
+    assert np.median(off) < 1e-5
+    assert np.median(np.abs(features(normals) - features(-normals)).max(axis=1)) > 0.01
+
+
+# ---- the command line ----------------------------------------------------------------------------------
+
+
+def ask(*words):
+    return run(program, "geomoe3d", [str(word) for word in words])
+
+
+def test_index_and_locate_in_the_shell(rooms, scan, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    first, other = rooms
+    np.save("other.npy", scanned(other, UTM + AWAY, 2))
+    np.save("first.npy", scanned(first, UTM, 1))
+    np.save("scan.npy", scan[0])
+    grid = ("--voxel-size", GRID)
+    assert ask("index", "other.npy", "house.map", *grid) == OK
+    assert ask("index", "other.npy", "first.npy", "house.map", *grid) == OK
+    assert "2 clouds (1 new)" in capfd.readouterr().out
+    assert ask("locate", "scan.npy", "house.map", *grid, "--json", "--output", "poses.tum") == OK
+    told = json.loads(capfd.readouterr().out)
+    assert told["status"] == "ok"
+    assert told["scan"] == "scan"
+    assert shift(np.array(told["places"][0]["T_map_scan"]), scan[1]) < 0.05
+    line = [line for line in (tmp_path / "poses.tum").read_text().splitlines() if line[0] != "#"]
+    np.testing.assert_allclose([float(word) for word in line[0].split()[1:4]], scan[1][:3, 3], atol=0.05)
+    assert ask("locate", "scan.npy", "house.map", *grid, "--near", "1,2", "--within", "3") == BAD_INPUT
+    assert "three numbers" in capfd.readouterr().err
+    assert ask("locate", "scan.npy", "nowhere.map") == BAD_INPUT
+    assert "there is no map 'nowhere.map'" in capfd.readouterr().err
+
+
+def test_a_laz_is_read_in_pieces(tmp_path):
+    pytest.importorskip("laspy")
+    points = np.random.default_rng(6).uniform(0, 10, (2500, 3)) + UTM
+    geomoe3d.save_points(tmp_path / "cloud.laz", points)
+    read = list(pieces(tmp_path / "cloud.laz", 1000).points())
+    assert [len(part) for part in read] == [1000, 1000, 500]
+    np.testing.assert_array_equal(
+        np.concatenate(read), geomoe3d.load_points(tmp_path / "cloud.laz").file_points
+    )

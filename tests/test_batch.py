@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dying_tasks import die_always
+from headless_browser import browse
 from small_scans import SETTINGS, cut, scene
 
 from geomoe3d import register_pairs
@@ -173,6 +174,63 @@ def test_transforms_and_page_are_written(finished):
     order = [name for name in re.findall(r"<small>(\w+)</small>", page) if len(name) < 5]
     sure = {outcome.id: outcome.confidence for outcome in report.outcomes}
     assert [sure[name] for name in order] == sorted(sure.values())
+
+
+# Uses the page as a person would and notes which pairs are shown, in their order.
+CHOOSE = """
+(() => {
+  const form = document.getElementById("choose"), log = {};
+  const note = (name) => {
+    form.dispatchEvent(new Event("input"));
+    const shown = [...document.querySelectorAll("#pairs li")].filter((pair) => !pair.hidden);
+    log[name] = shown.map((pair) => pair.dataset.id);
+  };
+  note("start");
+  form.elements.sort.value = "id"; note("by id");
+  form.elements.sort.value = "-confidence"; note("surest first");
+  form.elements.confidence.value = "0.0"; note("unsure");
+  form.elements.confidence.value = "1"; form.elements.find.value = "C.NPY"; note("found");
+  form.elements.find.value = "";
+  document.querySelector('[name="status"][value="error"]').checked = false; note("registered");
+  document.body.dataset.log = JSON.stringify(log);
+})();
+"""
+
+
+def test_the_page_sorts_and_filters(finished, tmp_path):
+    report, out = finished
+    seen = browse(tmp_path, (out / "page.html").read_text(), script=CHOOSE, webgl=False)
+    log, sure = json.loads(seen["log"]), {outcome.id: outcome.confidence for outcome in report.outcomes}
+    failed = {outcome.id for outcome in report.outcomes if outcome.result is None}
+    assert sorted(log["start"]) == sorted(sure) and [sure[k] for k in log["start"]] == sorted(sure.values())
+    assert log["by id"] == sorted(sure)
+    assert [sure[k] for k in log["surest first"]] == sorted(sure.values(), reverse=True)
+    assert set(log["unsure"]) == {k for k, value in sure.items() if value == 0} == failed
+    assert {"ac", "bc"} <= set(log["found"]) and "ab" not in log["found"]
+    assert set(log["registered"]) == set(sure) - failed
+
+
+def test_pages_of_the_pairs_and_of_those_that_left_the_table(scans, copied, tmp_path):
+    table = scans[0] / "two.csv"
+    write_table(table, [("a/b", "a", "b"), ("bc", "b", "c")])
+    register_pairs(table, copied, config=CONFIG, page=True, pages=True)
+    pages = copied / "pages"
+    assert sorted(path.name for path in pages.iterdir()) == ["a%2Fb.html", "bc.html"]
+    text = (copied / "page.html").read_text()
+    assert 'href="pages/a%252Fb.html"' in text and 'data-id="ac"' not in text
+    assert "source_points" in text or "a.npy" in (pages / "a%2Fb.html").read_text()
+    (pages / "mine.html").write_text((pages / "bc.html").read_text())
+    write_table(table, [("a/b", "a", "b")])
+    register_pairs(table, copied, config=CONFIG)  # without a word of pages
+    assert 'data-id="bc"' not in (copied / "page.html").read_text()
+    register_pairs(table, copied, config=CONFIG, pages=True)
+    assert sorted(path.name for path in pages.iterdir()) == ["a%2Fb.html", "mine.html"]
+    (pages / "bc.html").write_text("mine")
+    write_table(table, [("bc", "b", "c")])
+    with pytest.raises(InputError, match=r"bc\.html' is not of a batch.*leave the pages out"):
+        register_pairs(table, copied, config=CONFIG, pages=True)
+    register_pairs(table, copied, config=CONFIG, fresh=True)
+    assert sorted(path.name for path in pages.iterdir()) == ["bc.html", "mine.html"]
 
 
 def test_called_again_nothing_is_done_again(scans, finished):

@@ -48,9 +48,7 @@ class Page(HTMLParser):
     def rows(self) -> list[tuple[str, str]]:
         """Headed rows of the tables."""
         cells = [text for tag, text in self.texts if tag in ("th", "td")]
-        heads = [
-            k for k, (tag, _) in enumerate(t for t in self.texts if t[0] in ("th", "td")) if tag == "th"
-        ]
+        heads = [k for k, (tag, _) in enumerate(t for t in self.texts if t[0] in ("th", "td")) if tag == "th"]
         return [(cells[k], cells[k + 1]) for k in heads]
 
     def data(self) -> dict:

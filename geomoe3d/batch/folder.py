@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,7 +20,7 @@ from geomoe3d.runtime.journal import Journal
 
 RUN_FILE, JOURNAL_FILE = "run.json", "journal.jsonl"
 RESULTS_FILE, TABLE_FILE = "results.jsonl", "results.csv"
-PAGE_FILE, TRANSFORMS_FOLDER = "page.html", "transforms"
+PAGE_FILE, TRANSFORMS_FOLDER, PAGES_FOLDER = "page.html", "transforms", "pages"
 FORMAT = "geomoe3d batch 1"
 TABLE_HEAD = "id,status,confidence,overlap,"
 PAGE_MARK = '<meta name="generator" content="geomoe3d batch">'
@@ -74,14 +74,17 @@ def check_can_be_folder(path: Path, what: str) -> Path:
     return there
 
 
-def check_extras(folder: Path, ids: Iterable[str], *, transforms: bool, page: bool) -> None:
-    """Refuse to write a page or transforms over what is not of a batch, before work begins.
+def check_extras(
+    folder: Path, ids: Iterable[str], *, transforms: bool, page: bool, pages: bool = False
+) -> None:
+    """Refuse to write pages or transforms over what is not of a batch, before work begins.
 
     Args:
         folder: of the batch, there or not.
         ids: of its pairs.
         transforms: whether transforms are going to be written.
         page: whether a page is.
+        pages: whether a page of every pair is.
 
     Raises:
         InputError: a file that is not of a batch has such a name, or an id is too long to name a file.
@@ -89,21 +92,30 @@ def check_extras(folder: Path, ids: Iterable[str], *, transforms: bool, page: bo
     path = folder / PAGE_FILE
     if page and path.exists() and not has_mark(path, PAGE_MARK):
         raise InputError(f"{foreign(path)}, or leave the page out")
-    place = folder / TRANSFORMS_FOLDER
-    if not transforms:
-        return
+    names = list(ids)
+    if transforms:
+        _check_files(
+            folder / TRANSFORMS_FOLDER, {name: transform_name(name) for name in names}, _is_own_transform
+        )
+    if pages:
+        _check_files(folder / PAGES_FOLDER, {name: page_name(name) for name in names}, is_own_page)
+
+
+def _check_files(place: Path, names: dict[str, str], is_own: Callable[[Path], bool]) -> None:
+    """Refuse to write files, by id, into a folder where one of them is somebody else's or has too long a name."""
+    what = f"or leave the {place.name} out"
     if place.exists() and not place.is_dir():
-        raise InputError(f"{foreign(place)}, or leave the transforms out")
-    for name in ids:
-        path = place / transform_name(name)
-        length = len(path.name.encode())
+        raise InputError(f"{foreign(place)}, {what}")
+    for name, file in names.items():
+        length = len(file.encode())
         if length > _LONGEST_NAME:
             raise InputError(
                 f"the id '{name}' makes a file name of {length} bytes, at most {_LONGEST_NAME} are possible; "
-                "give shorter ones in the column id, or leave the transforms out"
+                f"give shorter ones in the column id, {what}"
             )
-        if path.exists() and not _is_own_transform(path):
-            raise InputError(f"{foreign(path)}, or leave the transforms out")
+        path = place / file
+        if path.exists() and not is_own(path):
+            raise InputError(f"{foreign(path)}, {what}")
 
 
 def foreign(path: Path, what: str = "a batch") -> str:
@@ -127,10 +139,13 @@ def remove_batch(folder: Path) -> None:
         return
     if (folder / JOURNAL_FILE).is_file():
         Journal(folder / JOURNAL_FILE).close()  # refused while another process holds it
-    place = folder / TRANSFORMS_FOLDER
-    remove([path for path in _files(place) if _is_own_transform(path)])
-    if place.is_dir() and not any(place.iterdir()):
-        place.rmdir()
+    for place, is_own in (
+        (folder / TRANSFORMS_FOLDER, _is_own_transform),
+        (folder / PAGES_FOLDER, is_own_page),
+    ):
+        remove([path for path in files_in(place) if is_own(path)])
+        if place.is_dir() and not any(place.iterdir()):
+            place.rmdir()
     if has_mark(folder / PAGE_FILE, PAGE_MARK):
         remove([folder / PAGE_FILE])
     # The last one says whose the others are.
@@ -156,6 +171,33 @@ def transform_name(name: str) -> str:
     return f"{quote(name, safe=' +=,@')}.txt"
 
 
+def page_name(name: str) -> str:
+    """The file of the page of a pair."""
+    return f"{quote(name, safe=' +=,@')}.html"
+
+
+def pair_mark(name: str) -> str:
+    """What the page of a pair says in its head."""
+    return f'<meta name="geomoe3d-pair" content="{page_name(name)}">'
+
+
+def is_own_page(path: Path) -> bool:
+    """By its mark, which names its pair: a copy under another name is the user's."""
+    return f'<meta name="geomoe3d-pair" content="{path.name}">'.encode() in _head(path)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder if it is not there.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
+
+
 def write_transforms(folder: Path, results: Iterable[tuple[str, RegistrationResult]]) -> None:
     """One text file per pair; those that an earlier call wrote of other pairs are removed.
 
@@ -166,10 +208,7 @@ def write_transforms(folder: Path, results: Iterable[tuple[str, RegistrationResu
     Raises:
         OutputError: a file cannot be written or removed.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
+    make_folder(folder)
     written = set()
     for name, result in results:
         path = folder / transform_name(name)
@@ -181,7 +220,7 @@ def write_transforms(folder: Path, results: Iterable[tuple[str, RegistrationResu
         ]
         save_transform(path, result.T_target_source, comments, force=True)
         written.add(path.name)
-    remove([path for path in _files(folder) if path.name not in written and _is_own_transform(path)])
+    remove([path for path in files_in(folder) if path.name not in written and _is_own_transform(path)])
 
 
 def _is_own_transform(path: Path) -> bool:
@@ -190,7 +229,8 @@ def _is_own_transform(path: Path) -> bool:
     return found is not None and found[1] in (None, " ".join(path.stem.split()))
 
 
-def _files(folder: Path) -> list[Path]:
+def files_in(folder: Path) -> list[Path]:
+    """The files of a folder; none where there is no folder."""
     return [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
 
 

@@ -1,6 +1,7 @@
 """One self-contained page with a small picture of every pair, the doubtful first.
 
-No script, no network. Some 8 kB and 50 ms per pair; beyond 2,000 pairs the surest go without a picture.
+A small script sorts and filters; no network. Some 8 kB and 50 ms per pair; beyond 2,000 pairs the surest go
+without a picture.
 """
 
 from __future__ import annotations
@@ -8,13 +9,16 @@ from __future__ import annotations
 import base64
 from collections import Counter
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from markupsafe import Markup
 
-from geomoe3d.batch.folder import PAGE_MARK
+from geomoe3d.batch.folder import PAGE_MARK, PAGES_FOLDER, files_in, is_own_page, page_name
 from geomoe3d.batch.store import Outcome
 from geomoe3d.batch.table import PairRow
 from geomoe3d.clouds.io import load_points
@@ -22,6 +26,7 @@ from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import STATUS_WORDS, thin
 from geomoe3d.visual.templates import render
@@ -34,47 +39,71 @@ _WIDTH, _HEIGHT = 280, 150
 _UNDRAWN = "no picture: one of the surest"
 
 
-def save_batch_page(path: Path, rows: Sequence[PairRow], outcomes: Sequence[Outcome]) -> None:
+@shows_progress("pictures")
+def save_batch_page(
+    path: Path, rows: Sequence[PairRow], outcomes: Sequence[Outcome], *, progress: Watch = None
+) -> None:
     """Write the page; an older one is replaced.
 
     Args:
         path: the file to be written.
         rows: what was to be done.
         outcomes: what became of it, in the same order.
+        progress: told of pictures drawn.
 
     Raises:
         OutputError: the page cannot be written.
     """
     _points.cache_clear()  # files may have changed since the last page of this process
-    write_text(path, render_batch_page(rows, outcomes), force=True)
+    pages = {path.name for path in files_in(path.parent / PAGES_FOLDER) if is_own_page(path)}
+    write_text(path, render_batch_page(rows, outcomes, pages, progress), force=True)
 
 
-def render_batch_page(rows: Sequence[PairRow], outcomes: Sequence[Outcome]) -> str:
-    """The text of the page; the same results and files give the same text."""
+def render_batch_page(
+    rows: Sequence[PairRow],
+    outcomes: Sequence[Outcome],
+    pages: AbstractSet[str] = frozenset(),
+    progress: Watch = None,
+) -> str:
+    """The text of the page; the same results and files give the same text.
+
+    Args:
+        rows, outcomes: as for `save_batch_page`.
+        pages: names of the files in ``pages`` that the pairs are linked to.
+        progress: told of pictures drawn.
+    """
     order = sorted(
         range(len(rows)), key=lambda k: (outcomes[k].result is not None, outcomes[k].confidence, k)
     )
     drawn = set(order[:MAX_PICTURES])
     # Pairs of one target are drawn one after the other, so that it is read once.
-    pictures = {
-        k: _picture(rows[k], outcomes[k])
-        for k in sorted(drawn, key=lambda k: (rows[k].target, rows[k].source))
-    }
+    pictures: dict[int, tuple[str, str]] = {}
+    for k in sorted(drawn, key=lambda k: (rows[k].target, rows[k].source)):
+        if progress:
+            progress(len(pictures), len(drawn))
+        pictures[k] = _picture(rows[k], outcomes[k])
+    if progress:
+        progress(len(pictures), len(drawn))
     counts = Counter(outcome.status for outcome in outcomes)
     return render(
         "batch/page.html",
         generator=Markup(PAGE_MARK),
         title=f"{len(rows):,} pairs",
         counts=", ".join(f"{count:,} {_word(status)}" for status, count in sorted(counts.items())),
-        cards=[_card(rows[k], outcomes[k], *pictures.get(k, ("", _UNDRAWN))) for k in order],
+        statuses=[(status, count, _word(status)) for status, count in sorted(counts.items())],
+        cards=[_card(rows[k], outcomes[k], *pictures.get(k, ("", _UNDRAWN)), pages) for k in order],
         width=_WIDTH,
         height=_HEIGHT,
     )
 
 
-def _card(row: PairRow, outcome: Outcome, image: str, blank: str) -> dict[str, str]:
+def _card(row: PairRow, outcome: Outcome, image: str, blank: str, pages: AbstractSet[str]) -> dict[str, Any]:
     result = outcome.result
+    page = page_name(row.id)
     return {
+        "page": f"{PAGES_FOLDER}/{quote(page)}" if page in pages else "",
+        "confidence": f"{outcome.confidence:.4f}",
+        "overlap": f"{result.overlap:.4f}" if result and np.isfinite(result.overlap) else "0",
         "image": image,
         "blank": blank,
         "status": outcome.status,

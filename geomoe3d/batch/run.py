@@ -11,9 +11,12 @@ from typing import Any
 
 from geomoe3d.batch.folder import (
     PAGE_FILE,
+    PAGE_MARK,
+    PAGES_FOLDER,
     TRANSFORMS_FOLDER,
     check_can_be_folder,
     check_extras,
+    has_mark,
     write_transforms,
 )
 from geomoe3d.batch.memory import choose_workers, gibibytes, worker_bytes
@@ -148,7 +151,6 @@ def try_out(pool: Pool, settings: Settings) -> None:
         ) from None
 
 
-@shows_progress("pairs")
 def register_pairs(
     pairs: str | os.PathLike[str] | Iterable[PairLike | PairRow],
     out: str | os.PathLike[str],
@@ -158,6 +160,7 @@ def register_pairs(
     scheduler: str | None = None,
     transforms: bool = False,
     page: bool = False,
+    pages: bool = False,
     fresh: bool = False,
     retry: bool = False,
     cache: str | None = None,
@@ -178,12 +181,13 @@ def register_pairs(
             the caller's script to be importable (``if __name__ == "__main__":``).
         scheduler: address of a Dask scheduler instead; its workers must see the files under the same paths.
         transforms: write ``transforms/<id>.txt`` for every pair that has a transform.
-        page: write ``page.html`` with a picture of every pair.
+        page: write ``page.html`` with a picture of every pair; one of an earlier call is always brought up to date.
+        pages: write ``pages/<id>.html`` for every pair that has a transform, to turn its clouds in.
         fresh: forget what the folder holds of an earlier batch; not before all that can be refused is known.
         retry: do the pairs again that could not be registered.
         cache: folder of described clouds; None: the user's own; "": none.
-        progress: called with (pairs done, pairs in all); None shows a bar when it takes long, False
-            shows nothing.
+        progress: called with (pairs done, pairs in all); None shows a bar when it takes long, and another as
+            pictures are drawn; False shows nothing.
         say: called with a sentence on workers and memory before the work begins.
 
     Raises:
@@ -198,27 +202,34 @@ def register_pairs(
     config = resolved(config)
     labour = Labour(workers, scheduler, cache).checked()
     store = BatchStore(folder, config, fresh=fresh)
-    check_extras(folder, [row.id for row in rows], transforms=transforms, page=page)
-    records, kept = work(rows, store, config, labour, retry, progress or None, say)
+    check_extras(folder, [row.id for row in rows], transforms=transforms, page=page, pages=pages)
+    records, kept = work(rows, store, config, labour, retry, progress=progress, say=say)
     outcomes = tuple(store.outcome(records[row.id]) for row in rows)
     store.write_results(records[row.id] for row in rows)
     if transforms:
         found = ((o.id, o.result) for o in outcomes if o.result is not None and has_transform(o.result))
         write_transforms(folder / TRANSFORMS_FOLDER, found)
-    if page:
+    told: Watch = False if progress is not None else None
+    if pages:
+        from geomoe3d.batch.pair_pages import write_pages
+
+        write_pages(folder / PAGES_FOLDER, rows, outcomes, progress=told)
+    if page or has_mark(folder / PAGE_FILE, PAGE_MARK):  # an older page must not show what is no longer so
         from geomoe3d.batch.page import save_batch_page
 
-        save_batch_page(folder / PAGE_FILE, rows, outcomes)
+        save_batch_page(folder / PAGE_FILE, rows, outcomes, progress=told)
     return BatchReport(folder, outcomes, len(rows) - kept, kept)
 
 
+@shows_progress("pairs")
 def work(
     rows: list[PairRow],
     store: BatchStore,
     config: RegistrationConfig,
     labour: Labour,
     retry: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    *,
+    progress: Watch = None,
     say: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, dict[str, Any]], int]:
     """Records of all rows by id, those that were missing made now, and how many were there.
@@ -237,7 +248,7 @@ def work(
         with store.journal() as journal:
             records = store.finished(wanted, with_errors=not retry)
             kept = len(records)
-            if progress is not None:
+            if progress:
                 progress(kept, len(rows))
             missing = [row for row in rows if row.id not in records]
             if not missing:
@@ -250,7 +261,7 @@ def work(
                     made = as_record(name, task.fingerprint, None, made.reason)
                 journal.append(made)
                 records[name] = made
-                if progress is not None:
+                if progress:
                     progress(len(records), len(rows))
         return records, kept
     finally:

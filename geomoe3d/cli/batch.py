@@ -26,6 +26,9 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @configuration_options
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
 @click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
+@click.option(
+    "--pages", is_flag=True, help="Write OUT/pages/<id>.html for every pair, to turn its clouds in."
+)
 @click.option("--fresh", is_flag=True, help="Delete the results of an earlier batch in OUT first.")
 @click.option("--retry", is_flag=True, help="Try the pairs again that could not be registered.")
 @click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
@@ -43,6 +46,7 @@ def command(
     config: RegistrationConfig,
     transforms: bool,
     page: bool,
+    pages: bool,
     fresh: bool,
     retry: bool,
     cache: str | None,
@@ -57,9 +61,9 @@ def command(
     only. Exit code 0 if every pair is ok, 3 if not, 2 for unusable input.
     """
     from geomoe3d.batch.run import ALL_THAT_FIT, register_pairs
-    from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
+    from geomoe3d.cli.progress import stdout_to_stderr
 
-    with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:
+    with stdout_to_stderr():
         report = register_pairs(
             pairs,
             out,
@@ -68,10 +72,11 @@ def command(
             scheduler=scheduler,
             transforms=transforms,
             page=page,
+            pages=pages,
             fresh=fresh,
             retry=retry,
             cache="" if no_cache else cache,
-            progress=progress,
+            progress=False if quiet else None,
             say=lambda text: None if quiet else click.echo(text, err=True),
         )
     if not quiet:

@@ -261,7 +261,12 @@ class Survey:
         if not rows:
             return
         records, _ = work(
-            list(rows.values()), self.store, self.config, self.labour, progress=self._count(), say=self.say
+            list(rows.values()),
+            self.store,
+            self.config,
+            self.labour,
+            progress=self._count() or False,
+            say=self.say,
         )
         for pair, row in rows.items():
             outcome = self.store.outcome(records[row.id])
@@ -298,7 +303,12 @@ class Survey:
             rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
         unique = {row.id: row for row in rows.values()}
         records, _ = work(
-            list(unique.values()), self.store, self.config, self.labour, progress=self._count(), say=self.say
+            list(unique.values()),
+            self.store,
+            self.config,
+            self.labour,
+            progress=self._count() or False,
+            say=self.say,
         )
         for number, row in rows.items():
             pair, outcome = pairs[number], self.store.outcome(records[row.id])

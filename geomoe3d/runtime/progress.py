@@ -81,21 +81,15 @@ def progress_bar(what: str, *, quiet: bool = False) -> Iterator[Callable[..., No
     elif not on_terminal():
         yield _LogLines(what)
     else:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"))
+        columns = (BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn(), TextColumn("left"))
         with rich_progress(
             TextColumn(what), *columns, TimeRemainingColumn(), TextColumn("{task.fields[words]}")
         ) as progress:
-            task = progress.add_task(what, total=None, words="")
+            task = progress.add_task(what, total=None, words="", count="starting")
             yield lambda done, total, words="": progress.update(
-                task, completed=done, total=total, words=words
+                task, completed=done, total=total, words=words, count=f"{done:,}/{total:,}"
             )
 
 

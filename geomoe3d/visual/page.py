@@ -54,15 +54,21 @@ def save_page(view: RegistrationView, path: str | os.PathLike[str], *, force: bo
     write_text(path, render_page(view), force=force)
 
 
-def render_page(view: RegistrationView, *, max_points: int = MAX_POINTS) -> str:
-    """The text of the page that `save_page` writes; the same view gives the same text."""
+def render_page(view: RegistrationView, *, max_points: int = MAX_POINTS, mark: str = "") -> str:
+    """The text of the page that `save_page` writes; the same view gives the same text.
+
+    Args:
+        view: what to show.
+        max_points: of each cloud.
+        mark: one more element for the head, as HTML.
+    """
     drawing = build_drawing(view, max_points=max_points)
     result = view.result
     source, target = result.source.name, result.target.name
     made_by = f"geomoe3d {result.versions.get('geomoe3d', '')}".strip()
     status_words = STATUS_WORDS[result.status]
     values = {
-        "generator": Markup('<meta name="generator" content="{}">').format(made_by),
+        "generator": Markup('<meta name="generator" content="{}">').format(made_by) + Markup(mark),
         "made_by": made_by,
         "title": f"{source} on {target}: {status_words}",
         "stage_label": f"Point clouds {source} and {target}, {status_words}",

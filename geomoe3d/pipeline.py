@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,6 +41,8 @@ REGISTRIES: dict[str, Registry[Any]] = {
 
 Clouds = tuple[PreparedCloud, PreparedCloud]
 Places = tuple[FloatArray, FloatArray] | None
+Sides = Literal["sensor", "flipped", "centroid"]
+"""Where normals point: to the sensor, known or guessed; the same with the source's turned over; to the centroid."""
 
 
 class Pipeline:
@@ -73,10 +75,17 @@ class Pipeline:
         self.refiner: Refiner = refiner.make(config.refinement)
 
     def prepare(
-        self, cloud: PointCloud, voxel_size: float, viewpoint: FloatArray | None, clock: StageClock
+        self,
+        cloud: PointCloud,
+        voxel_size: float,
+        viewpoint: FloatArray | None,
+        clock: StageClock,
+        sides: Sides = "sensor",
     ) -> PreparedCloud:
         """One cloud on the grid, with normals and features, or as the cache holds it."""
         config, seed, describe = self.config.preparation, self.config.seed, self.descriptor
+        if sides == "centroid":
+            config, viewpoint = config.model_copy(update={"viewpoint": "centroid"}), None
 
         def make() -> PreparedCloud:
             clock("prepare")
@@ -87,6 +96,21 @@ class Pipeline:
         if self._cache is None:
             return make()
         return self._cache.fetch(cloud, feature_identity(voxel_size, viewpoint, config, describe, seed), make)
+
+    def prepare_both(
+        self,
+        clouds: tuple[PointCloud, PointCloud],
+        voxel_size: float,
+        views: tuple[FloatArray | None, FloatArray | None],
+        clock: StageClock,
+        sides: Sides = "sensor",
+    ) -> Clouds:
+        """`prepare` for source and target."""
+        first, second = (
+            self.prepare(cloud, voxel_size, view, clock, sides)
+            for cloud, view in zip(clouds, views, strict=True)
+        )
+        return first, second
 
     def match(self, clouds: Clouds, places: Places, clock: StageClock, limit: int | None = None) -> Pair:
         """Putative correspondences; at most ``limit``, None takes what the configuration says."""
@@ -127,7 +151,12 @@ class Pipeline:
         return source, replace(clouds[1], viewpoint=None)
 
     def further_pairs(
-        self, pair: Pair, prepared: Clouds, places: Places, clock: StageClock, flipped: bool
+        self,
+        pair: Pair,
+        prepared: Clouds,
+        places: Places,
+        clock: StageClock,
+        sides: Sides = "sensor",
     ) -> Iterator[Pair]:
         """The same scans for a second look: more matches of their grid, where there are more, and coarser grids."""
         usual, most = self.config.matching.max_correspondences, self.config.second_look.max_correspondences
@@ -135,15 +164,13 @@ class Pipeline:
             yield self.match(pair.clouds, places, clock, most)
         for factor in self.config.second_look.grids:
             size = factor * pair.voxel_size
-            bare = [PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in prepared]
+            bare = tuple(PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in prepared)
+            views = prepared[0].viewpoint, prepared[1].viewpoint
             try:
-                coarse = (
-                    self.prepare(bare[0], size, prepared[0].viewpoint, clock),
-                    self.prepare(bare[1], size, prepared[1].viewpoint, clock),
-                )
+                coarse = self.prepare_both((bare[0], bare[1]), size, views, clock, sides)
             except EmptyCloudError:  # a cloud is too small for this grid
                 continue
-            yield self.match(self.flipped(coarse, clock) if flipped else coarse, places, clock)
+            yield self.match(self.flipped(coarse, clock) if sides == "flipped" else coarse, places, clock)
 
     def warm_up(self) -> None:
         """Load weights now, and say now what is wrong with them."""

@@ -23,7 +23,7 @@ from geomoe3d.clouds.prepare import (
     robust_extent,
     scale_mismatch,
 )
-from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints
+from geomoe3d.clouds.viewpoint import MOST_SIGN_BREAKS, find_viewpoints, known_viewpoints, sign_breaks
 from geomoe3d.config import RegistrationConfig, build_config
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
@@ -35,12 +35,12 @@ from geomoe3d.decision.scale import likely_unit_ratio, measure_scale, seeming_un
 from geomoe3d.decision.selection import Selection
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.features.cache import FeatureCache
-from geomoe3d.pipeline import Clouds, Pipeline, Places, resolved, with_weights
+from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides, resolved, with_weights
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
-from geomoe3d.types import Correspondences, FilterOutput, FloatArray, PointCloud
+from geomoe3d.types import FilterOutput, FloatArray, PointCloud
 
 
 class Registrar:
@@ -168,17 +168,20 @@ class Registrar:
         wanted = config.voxel_size or choose_voxel_size(*clouds, config.preparation.voxel_points)
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         views = find_viewpoints(*clouds, config.preparation.viewpoint)
-        prepared = (
-            self.pipeline.prepare(clouds[0], voxel_size, views[0], clock),
-            self.pipeline.prepare(clouds[1], voxel_size, views[1], clock),
-        )
+        prepared = self.pipeline.prepare_both(clouds, voxel_size, views, clock)
         # Known places, not guessed ones: the network was trained on true ones, or none.
         places = known_viewpoints(*clouds, config.preparation.viewpoint)
-        given = None if correspondences is None else between_clouds(correspondences, prepared)
-        pair, weighed, decision = self._look(prepared, places, clock, initial, given)
-        if places is None and self._asks_flipped(decision.judgement):
-            other = self._look(prepared, None, clock, initial, given, rivals=decision)
-            if other[2].judgement.confidence > decision.judgement.confidence:
+        asked: dict[str, Any] = {"initial": initial, "given": correspondences}
+        pair, weighed, decision = self._look(prepared, places, clock, **asked)
+        for sides in self._other_sides(prepared, places):
+            if decision.judgement.status == "ok":
+                break
+            if sides == "centroid":
+                prepared = self.pipeline.prepare_both(clouds, voxel_size, (None, None), clock, sides)
+            other = self._look(prepared, None, clock, **asked, sides=sides, rivals=decision)
+            surer = other[2].judgement.confidence > decision.judgement.confidence
+            # Without sensors less speaks against a wrong answer, so it is taken only where it is sure.
+            if surer and (sides == "flipped" or other[2].judgement.status == "ok"):
                 pair, weighed, decision = other
         clock("decide")
         if decision.answer is not None:
@@ -208,8 +211,8 @@ class Registrar:
         places: Places,
         clock: StageClock,
         initial: ArrayLike | None,
-        given: Correspondences | None,
-        *,
+        given: ArrayLike | None,
+        sides: Sides = "sensor",
         rivals: Decision | None = None,
     ) -> tuple[Pair, FilterOutput, Decision]:
         """From clouds with features to a decision; a doubtful one with hypotheses of coarser grids too.
@@ -220,12 +223,14 @@ class Registrar:
             clock: told of the stages.
             initial: a user's first guess, or None.
             given: a user's own matches, which then take the place of ours, or None.
-            rivals: what an earlier look decided. This one then turns the source's normals over, on every grid,
-                and its answer must beat what was found before, as in repeated structure.
+            sides: where normals point, on every grid.
+            rivals: what an earlier look decided; this one's answer must beat what was found before, as in
+                repeated structure.
         """
-        line, look, flipped = self.pipeline, self.config.second_look, rivals is not None
-        clouds = line.flipped(prepared, clock) if flipped else prepared
-        pair = line.match(clouds, places, clock) if given is None else line.pair(clouds, given, places)
+        line, look = self.pipeline, self.config.second_look
+        clouds = line.flipped(prepared, clock) if sides == "flipped" else prepared
+        matched = None if given is None else between_clouds(given, prepared)
+        pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
         weighed, proposed = line.propose(pair, clock)
         with single_blas_thread():
             selection = Selection(pair, line.scorers, line.refiner, self.config, clock)
@@ -237,7 +242,7 @@ class Registrar:
             decision = selection.decide()
             if self._is_doubtful(decision.judgement):
                 if given is None:
-                    for further in line.further_pairs(pair, prepared, places, clock, flipped):
+                    for further in line.further_pairs(pair, prepared, places, clock, sides):
                         selection.add(line.propose(further, clock)[1])
                 decision = selection.decide(look.num_refined, look.num_judged)
         return pair, weighed, decision
@@ -268,10 +273,21 @@ class Registrar:
         wanted = bool(look.grids) or look.max_correspondences > 0
         return doubtful and bool(self.pipeline.scorers) and wanted
 
-    def _asks_flipped(self, judgement: Judgement) -> bool:
-        """Whether, no sensor being known, the pair is asked again with the source's normals turned over: a guessed
-        sensor may stand on the wrong side of everything, and then no feature of one scan is like the other's."""
-        return judgement.status != "ok" and self.config.second_look.flip and bool(self.pipeline.scorers)
+    def _other_sides(self, prepared: Clouds, places: Places) -> Iterator[Sides]:
+        """Which other sides of normals a pair that is not ok is asked with.
+
+        Where no sensor is known, the source's turned over: a guessed sensor may stand on the wrong side of
+        everything, and then no feature of one scan is like the other's. Then all turned to the centroid, as suits
+        objects, meshes and merged scans, which no sensor saw as a whole; where sensors are believed, only if the
+        normals that follow from that contradict themselves.
+        """
+        if not self.config.second_look.flip or not self.pipeline.scorers:
+            return
+        if places is None:
+            yield "flipped"
+        automatic = self.config.preparation.viewpoint == "auto"
+        if automatic and (places is None or max(map(sign_breaks, prepared)) > MOST_SIGN_BREAKS):
+            yield "centroid"
 
 
 def register(

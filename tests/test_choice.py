@@ -248,10 +248,10 @@ def test_an_unsure_answer_takes_one_at_more_matches_and_on_every_coarser_grid(gr
 def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatch):
     prepare_cloud = Pipeline.prepare
 
-    def small(self, cloud, voxel_size, viewpoint, clock):
+    def small(self, cloud, voxel_size, viewpoint, clock, *rest):
         if voxel_size > VOXEL:
             raise EmptyCloudError("2 points remain")
-        return prepare_cloud(self, cloud, voxel_size, viewpoint, clock)
+        return prepare_cloud(self, cloud, voxel_size, viewpoint, clock, *rest)
 
     monkeypatch.setattr(Pipeline, "prepare", small)
     source, target, _ = make_sample_pair(seed=0)

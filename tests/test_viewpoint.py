@@ -7,8 +7,17 @@ import pytest
 from corner_scenes import scene
 from surface_pairs import corner
 
-from geomoe3d.clouds.prepare import orient_normals
-from geomoe3d.clouds.viewpoint import believed_viewpoints, find_viewpoints, guess_viewpoint
+from geomoe3d.clouds.prepare import orient_normals, prepare
+from geomoe3d.clouds.viewpoint import (
+    MOST_SIGN_BREAKS,
+    believed_viewpoints,
+    find_viewpoints,
+    guess_viewpoint,
+    sign_breaks,
+)
+from geomoe3d.config import PreparationConfig, load_config
+from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
+from geomoe3d.registration import Registrar
 from geomoe3d.types import PointCloud
 
 
@@ -126,3 +135,47 @@ def test_a_guess_for_points_on_a_line_or_in_a_plane_is_finite() -> None:
     for directions in (1, 2):
         points = rng.normal(size=(50, directions)) @ np.eye(3)[:directions]
         assert np.isfinite(guess_viewpoint(points, np.tile([0.0, 0, 1], (50, 1)), 0.1)).all()
+
+
+def bumpy_body(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and outward normals of nine balls that overlap, about 2 m across."""
+    rng = np.random.default_rng(seed)
+    centers, radii = rng.uniform(-1, 1, (9, 3)) * [1, 0.7, 0.5], rng.uniform(0.25, 0.5, 9)
+    ball = rng.integers(0, 9, count)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = centers[ball] + radii[ball, None] * normals
+    away = np.linalg.norm(points[:, None] - centers, axis=2) - radii
+    away[np.arange(count), ball] = 0
+    return points[(away > -1e-9).all(1)], normals[(away > -1e-9).all(1)]
+
+
+def test_normals_contradict_a_sensor_that_saw_around_a_body_but_not_the_one_that_was_there() -> None:
+    points, normals = bumpy_body(1, 40_000)
+    sensor = np.array([3.0, 1.0, 2.0])
+    front = points[np.einsum("ij,ij->i", sensor - points, normals) > 0]
+    config, elsewhere = PreparationConfig(), np.array([0.0, -0.5, -1.0])
+    seen = prepare(PointCloud(front), 0.06, config, viewpoint=sensor)
+    assert sign_breaks(seen) < 0.2 * MOST_SIGN_BREAKS
+    for cloud in (front, points):
+        doubted = prepare(PointCloud(cloud), 0.06, config, viewpoint=elsewhere)
+        assert sign_breaks(doubted) > MOST_SIGN_BREAKS
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_scan_of_an_object_whose_origin_is_no_sensor_is_found_on_the_whole_object(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, normals = bumpy_body(seed, 60_000)
+    shift, turn = np.array([0, 0.5, 1]), np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    front = points[np.einsum("ij,ij->i", np.array([3.0, 1, 2]) - points, normals) > 0] + shift
+    T = make_transform(turn * np.linalg.det(turn), np.zeros(3))
+    T[:3, 3] = [0.6, -1.0, 0.3] - transform_points(T, points + shift).mean(0)
+    whole = transform_points(T, points[::2] + shift)
+    source, target = (p + rng.normal(0, 0.003, p.shape) for p in (front, whole))
+    result = Registrar().register(source, target)
+    assert result.ok, result.reasons
+    assert rotation_error_deg(result.T_target_source, T) < 1
+    moved = transform_points(result.T_target_source, front) - transform_points(T, front)
+    assert np.linalg.norm(moved, axis=1).max() < 0.03
+    believing = Registrar(load_config(None, ["preparation.viewpoint=origin"])).register(source, target)
+    assert not believing.ok  # what the sides of the normals do to it

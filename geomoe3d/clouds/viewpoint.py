@@ -9,12 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.geometry.columns import bounds
-from geomoe3d.types import BoolArray, FloatArray, PointCloud
+from geomoe3d.types import BoolArray, FloatArray, PointCloud, PreparedCloud
 
 # How near the origin, in extents, the mean, the middle of the box and the lowest corner come only where a
 # cloud was moved. Of depth-camera fragments the nearest were 0.36, 0.42 and 0.37, of laser scans in rooms
 # 0.037, 0.022 and 0.22; of fragments centred and then thinned by a grid, 99 of 100 had the mean within 0.03.
 _LEAST_MEAN, _LEAST_MIDDLE, _LEAST_CORNER = 0.025, 0.01, 0.05
+# Neighbours on a smooth surface turned to opposite sides: of fragments of rooms, scans and frames 0.1 to 2.5 %
+# (median 0.7), of object scans and meshes whose origin was no sensor 1.5 to 4.6 %, and 3 % in one cloud of any pair.
+MOST_SIGN_BREAKS = 0.025
 _PIXEL_DEG = 3.0
 _NUM_CANDIDATES = 200
 _NUM_KEPT = 4
@@ -88,6 +91,18 @@ def _sensor_may_be_at_origin(cloud: PointCloud) -> bool:
     mean = cloud.points.mean(axis=0) + cloud.origin
     moved = (mean, _LEAST_MEAN), ((low + high) / 2, _LEAST_MIDDLE), (low, _LEAST_CORNER)
     return all(float(np.linalg.norm(place)) >= least * extent for place, least in moved)
+
+
+def sign_breaks(cloud: PreparedCloud) -> float:
+    """Share of neighbours on one smooth surface whose normals are turned to opposite sides, in [0, 1]."""
+    from scipy.spatial import cKDTree
+
+    distance, near = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False).query(cloud.points, k=7)
+    rows, others = np.repeat(np.arange(len(cloud.points)), 6), np.asarray(near)[:, 1:].ravel()
+    close = np.asarray(distance)[:, 1:].ravel() < 2.5 * cloud.voxel_size
+    cosine = np.einsum("ij,ij->i", cloud.normals[rows[close]], cloud.normals[others[close]])
+    smooth = np.abs(cosine) > 0.9
+    return float((cosine[smooth] < 0).mean()) if smooth.any() else 0.0
 
 
 def guess_viewpoint(

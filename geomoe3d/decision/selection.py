@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.answer import Decision
-from geomoe3d.decision.confidence import judge, lead_over, measure_information
+from geomoe3d.decision.confidence import Judgement, judge, lead_over, measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
 from geomoe3d.refinement.base import Refiner
 from geomoe3d.runtime.timing import StageClock
@@ -29,6 +29,11 @@ _KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this i
 _MOST_ROUNDS = 6  # further hypotheses shown one by one, where a scorer rejects those that the clouds like
 _DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two transforms are different
 _MOST_TURN_DEG = 15.0
+_MOST_UNREFINED = 0.5
+_UNREFINED = (
+    "the answer could not be refined without fitting less well, and where the sensors stood is not known; right "
+    "answers can be"
+)
 
 
 class Selection:
@@ -105,6 +110,10 @@ class Selection:
         )
         support, count = self._support(answer), len(self._pair.matched)
         judgement = judge(answer, rival, lead, support, information, self._config.decision, count)
+        if judgement.status == "ok" and answer.note is not None and self._pair.matched.viewpoints is None:
+            # Of 139 answers that were ok on real scans, one had not been refined, and its sensors were known. Scans of
+            # two places that were ok had not been either.
+            judgement = Judgement("low_confidence", (_UNREFINED, *judgement.reasons), _MOST_UNREFINED)
         decision = Decision(answer, rival, lead, information, judgement, tuple(self.hypotheses))
         for note in (answer.note, self._overruled(answer)):
             decision = decision if note is None else decision.with_note(note)

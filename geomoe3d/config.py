@@ -59,7 +59,7 @@ class DescriptorConfig(PartConfig):
     name: str = Field(
         "fpfh",
         description="fpfh; multiscale (fpfh of three reaches); learned (a small network on these; more true matches, "
-        "but confidence was fitted with fpfh); or a class of your own: file.py:Class or module:Class",
+        "slower, and asked in the second look anyway); or a class of your own: file.py:Class or module:Class",
     )
     radius: float = Field(5.0, gt=0, description="neighbourhood of a feature, in voxels")
     neighbors: int = Field(100, ge=3, description="at most so many points make a feature")
@@ -137,6 +137,11 @@ class ScoringConfig(Section):
 class SecondLookConfig(Section):
     """More work on a pair whose first answer is doubtful."""
 
+    descriptor: str = Field(
+        "learned",
+        description="describes an answer's clouds once more where it is not ok: its matches join the others, its "
+        "features score; a name as descriptor.name, with its defaults. none, or the same as that: no",
+    )
     grids: tuple[float, ...] = Field(
         (1.5, 2.0),
         description="coarser grids, in voxels, on which further hypotheses are sought when the first answer "
@@ -152,7 +157,7 @@ class SecondLookConfig(Section):
         0.8, ge=0, le=1, description="an answer that is not ok is doubtful below this confidence"
     )
     num_refined: int = Field(
-        3, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
+        8, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
     )
     num_judged: int = Field(
         8,

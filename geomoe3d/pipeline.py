@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
-from geomoe3d.config import RegistrationConfig, ScoringConfig
+from geomoe3d.config import DescriptorConfig, RegistrationConfig, ScoringConfig
 from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.estimators.base import Estimator, estimator
 from geomoe3d.estimators.proposals import propose
@@ -54,6 +54,7 @@ class Pipeline:
 
     Attributes:
         descriptor, matcher, estimator, refiner: see their kinds.
+        second_descriptor: what describes the clouds of a doubtful answer once more, or None.
         filter: outlier rejection, or None without any.
         scorers: by name, in the order in which they are asked.
 
@@ -66,6 +67,7 @@ class Pipeline:
     def __init__(self, config: RegistrationConfig, cache: FeatureCache | None = None) -> None:
         self.config, self._cache = config, cache
         self.descriptor: Descriptor = descriptor.make(config.descriptor)
+        self.second_descriptor = _second_descriptor(config)
         self.matcher: Matcher = matcher.make(config.matching)
         _check_weights_are_wanted(config)
         wanted = config.filter.name != "none"
@@ -150,27 +152,50 @@ class Pipeline:
         source = with_normals_flipped(clouds[0], self.descriptor)
         return source, replace(clouds[1], viewpoint=None)
 
+    def described_again(self, pair: Pair, places: Places, clock: StageClock) -> tuple[Pair, Pair]:
+        """The pair with what the second descriptor says: its features with its matches alone, and with those of both.
+
+        Raises:
+            ValueError: there is no second descriptor.
+        """
+        if self.second_descriptor is None:
+            raise ValueError("there is no second descriptor")
+        clock("features")
+        source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in pair.clouds)
+        own = self.match((source, target), places, clock)
+        return own, self.pair(own.clouds, pair.matched.with_others(own.matched), places)
+
     def further_pairs(
         self,
-        pair: Pair,
+        looks: Sequence[Pair],
         prepared: Clouds,
         places: Places,
         clock: StageClock,
         sides: Sides = "sensor",
     ) -> Iterator[Pair]:
-        """The same scans for a second look: more matches of their grid, where there are more, and coarser grids."""
+        """The same scans for a second look: more matches of their grid, where there are more, and coarser grids.
+
+        ``looks``: the pair as the first descriptor sees it and, if it was asked, as the second does; the coarser
+        grids are described by the last of them.
+        """
         usual, most = self.config.matching.max_correspondences, self.config.second_look.max_correspondences
-        if len(pair.matched) >= usual and most > usual:
-            yield self.match(pair.clouds, places, clock, most)
+        for pair in looks:
+            if len(pair.matched) >= usual and most > usual:
+                yield self.match(pair.clouds, places, clock, most)
         for factor in self.config.second_look.grids:
-            size = factor * pair.voxel_size
+            size = factor * prepared[0].voxel_size
             bare = tuple(PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in prepared)
             views = prepared[0].viewpoint, prepared[1].viewpoint
             try:
                 coarse = self.prepare_both((bare[0], bare[1]), size, views, clock, sides)
             except EmptyCloudError:  # a cloud is too small for this grid
                 continue
-            yield self.match(self.flipped(coarse, clock) if sides == "flipped" else coarse, places, clock)
+            coarse = self.flipped(coarse, clock) if sides == "flipped" else coarse
+            if len(looks) > 1 and self.second_descriptor is not None:
+                clock("features")
+                source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in coarse)
+                coarse = source, target
+            yield self.match(coarse, places, clock)
 
     def warm_up(self) -> None:
         """Load weights now, and say now what is wrong with them."""
@@ -190,6 +215,7 @@ class Pipeline:
 
     def _parts(self) -> dict[str, Part]:
         one = {"descriptor": self.descriptor, "matcher": self.matcher, "filter": self.filter}
+        one["second descriptor"] = self.second_descriptor
         rest = {"estimator": self.estimator, **self.scorers, "refiner": self.refiner}
         return {kind: part for kind, part in {**one, **rest}.items() if part is not None}
 
@@ -232,6 +258,11 @@ def with_weights(config: RegistrationConfig, name_or_path: str) -> RegistrationC
     if scoring.scorers == "auto":
         scoring = scoring.model_copy(update={"scorers": ("surfaces",)})
     return config.model_copy(update={"filter": named, "scoring": scoring})
+
+
+def _second_descriptor(config: RegistrationConfig) -> Descriptor | None:
+    first, name = config.descriptor, config.second_look.descriptor
+    return None if name in ("none", first.name) else descriptor.make(DescriptorConfig(name=name))
 
 
 def _check_weights_are_wanted(config: RegistrationConfig) -> None:

@@ -40,7 +40,7 @@ from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
-from geomoe3d.types import FilterOutput, FloatArray, PointCloud
+from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, PointCloud
 
 
 class Registrar:
@@ -215,7 +215,8 @@ class Registrar:
         sides: Sides = "sensor",
         rivals: Decision | None = None,
     ) -> tuple[Pair, FilterOutput, Decision]:
-        """From clouds with features to a decision; a doubtful one with hypotheses of coarser grids too.
+        """From clouds with features to a decision; a doubtful one with hypotheses of another descriptor and of coarser
+        grids too.
 
         Args:
             prepared: both clouds on one grid.
@@ -232,17 +233,28 @@ class Registrar:
         matched = None if given is None else between_clouds(given, prepared)
         pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
         weighed, proposed = line.propose(pair, clock)
-        with single_blas_thread():
+
+        def select(pair: Pair, proposed: list[Hypothesis]) -> Selection:
             selection = Selection(pair, line.scorers, line.refiner, self.config, clock)
             selection.add(proposed)
             if rivals is not None:
                 selection.add(rivals.transforms())
             if initial is not None:
                 selection.add_guess(initial)
+            return selection
+
+        with single_blas_thread():
+            selection, looks = select(pair, proposed), [pair]
             decision = selection.decide()
+            if given is None and sides == "sensor" and self._is_described_again(decision.judgement):
+                again, pair = line.described_again(pair, places, clock)
+                looks.append(again)
+                proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
+                weighed, selection = line.weigh(pair), select(pair, proposed)
+                decision = selection.decide(look.num_refined, look.num_judged)
             if self._is_doubtful(decision.judgement):
                 if given is None:
-                    for further in line.further_pairs(pair, prepared, places, clock, sides):
+                    for further in line.further_pairs(looks, prepared, places, clock, sides):
                         selection.add(line.propose(further, clock)[1])
                 decision = selection.decide(look.num_refined, look.num_judged)
         return pair, weighed, decision
@@ -265,6 +277,11 @@ class Registrar:
             f"units differ: with all lengths of '{source.name}' divided by {ratio:.6g} the clouds fit"
             f"{seeming_units(ratio)}; bring both to one unit, a rigid motion cannot change scale"
         )
+
+    def _is_described_again(self, judgement: Judgement) -> bool:
+        """Whether the second descriptor is to be asked."""
+        known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
+        return known and judgement.status != "ok"
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""

@@ -7,8 +7,8 @@ the cloud's float64 ``origin``. Everything between loading and the result works 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,6 +161,23 @@ class Correspondences:
             self.normals_signed,
         )
 
+    def with_others(self, others: Correspondences) -> Correspondences:
+        """These and, after them, those of the same clouds that pair other points; what either lacks both lack."""
+        known = {row.tobytes() for row in self.points}
+        more = others.take(np.array([row.tobytes() not in known for row in others.points], dtype=np.bool_))
+
+        def both(name: str) -> Any:
+            parts = getattr(self, name), getattr(more, name)
+            return None if parts[0] is None or parts[1] is None else np.concatenate(parts)
+
+        rows = ("points", "source_index", "target_index", "feature_distance", "ratio", "mutual")
+        normals = None
+        if self.normals is not None and more.normals is not None:
+            one, other = (np.concatenate(sides) for sides in zip(self.normals, more.normals, strict=True))
+            normals = one, other
+        signed = self.normals_signed and more.normals_signed
+        return replace(self, **{name: both(name) for name in rows}, normals=normals, normals_signed=signed)
+
 
 class Score(Protocol):
     """What one scorer says of one hypothesis."""
@@ -193,6 +210,10 @@ class Hypothesis:
     asked: set[str] = field(default_factory=set)
     refined: Hypothesis | None = None
     note: str | None = None
+
+    def anew(self) -> Hypothesis:
+        """The same transform as it was proposed, to be scored by others."""
+        return Hypothesis(self.T_target_source, self.proposal_score, self.num_inliers)
 
     @property
     def score(self) -> float:

@@ -35,7 +35,7 @@ BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 """Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""
 UNRELATED_WEIGHT = 0.25
 LOOKS = (
-    ["second_look.grids=[]", "second_look.max_correspondences=0"],
+    ["second_look.descriptor=none", "second_look.grids=[]", "second_look.max_correspondences=0"],
     ["second_look.below=1.0", "decision.min_confidence=1.0"],
 )
 """Settings by which a pair gets one look, and always two."""

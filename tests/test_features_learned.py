@@ -54,6 +54,20 @@ def test_clouds_of_few_points_have_finite_features(kind: type[Descriptor], count
     assert np.isfinite(with_features(cloud, kind()).features).all()
 
 
+def test_fpfh_that_is_there_is_not_computed_again(pair, monkeypatch) -> None:
+    plain, first = LearnedDescriptor()(pair[0]), FpfhDescriptor()
+    described = with_features(pair[0], first)
+    of_others = LearnedDescriptor().again(described, FpfhDescriptor(radius=3.0))
+    asked = []
+    compute = FpfhDescriptor.__call__
+    monkeypatch.setattr(
+        FpfhDescriptor, "__call__", lambda self, c: (asked.append(len(c)), compute(self, c))[1]
+    )
+    again = with_features(described, LearnedDescriptor(), first).features
+    assert len(asked) == 2 and max(asked) < len(pair[0])
+    assert np.array_equal(again, plain) and np.array_equal(of_others, plain)
+
+
 def test_relations_turn_with_the_cloud(pair) -> None:
     fine, middle, _ = pyramid(pair[0])
     at = fine.take(np.arange(200))

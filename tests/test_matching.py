@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -279,3 +280,22 @@ def test_blocks_share_the_best_of_every_column(monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_allclose(x, y, atol=1e-6)
     assert 0 < parts[3].sum() < 300
     assert len(matching.nearest_features(a[:0], b, 1)[0]) == 0
+
+
+# ---- matches of two kinds together ---------------------------------------------------------------------
+
+
+def test_matches_of_two_kinds_stand_together_once_each() -> None:
+    source, target = pair(4)
+    first = match(source, target, MatchingConfig(name="mutual"), seed=0)
+    second = match(source, target, MatchingConfig(name="ratio", max_ratio=0.9))
+    both = first.with_others(second)
+    rows = [set(zip(m.source_index, m.target_index, strict=True)) for m in (first, second, both)]
+    assert rows[2] == rows[0] | rows[1] and len(both) == len(rows[2]) > len(first)
+    np.testing.assert_array_equal(both.take(slice(len(first))).points, first.points)
+    np.testing.assert_array_equal(both.source, source.points[both.source_index])
+    np.testing.assert_array_equal(both.normals[1], target.normals[both.target_index])
+    for name in ("feature_distance", "ratio", "mutual"):
+        assert len(getattr(both, name)) == len(both)
+    bare = first.with_others(replace(second, mutual=None, normals=None))
+    assert bare.mutual is None and bare.normals is None and len(bare) == len(both)

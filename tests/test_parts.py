@@ -162,7 +162,7 @@ def test_the_identity_of_a_pipeline_holds_every_part_and_follows_its_settings() 
         return Pipeline(resolved(load_config(None, list(assignments)))).identity()
 
     plain = of()
-    parts = {"descriptor", "matcher", "estimator", "surfaces", "network", "refiner"}
+    parts = {"descriptor", "second descriptor", "matcher", "estimator", "surfaces", "network", "refiner"}
     assert set(plain["parts"]) == parts
     assert json.loads(json.dumps(plain)) == plain
     assert {"numpy", "scipy", "torch", "small_gicp"} <= set(plain["versions"])
@@ -172,6 +172,7 @@ def test_the_identity_of_a_pipeline_holds_every_part_and_follows_its_settings() 
         "matching.neighbors=2",
         "estimator.name=svd",
         "refinement.name=icp",
+        "second_look.descriptor=multiscale",
     ):
         assert of(change)["parts"] != plain["parts"], change
 

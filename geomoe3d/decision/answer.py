@@ -64,7 +64,7 @@ class Decision:
     def transforms(self) -> list[Hypothesis]:
         """The answer and the alternative, as far as there are any, to be scored by others."""
         both = (h for h in (self.answer, self.alternative) if h is not None)
-        return [Hypothesis(h.T_target_source, h.proposal_score, h.num_inliers) for h in both]
+        return [h.anew() for h in both]
 
     def with_note(self, note: str, *, first: bool = False) -> Decision:
         """The same decision with one more sentence among the reasons, at their end or before them."""

@@ -36,18 +36,30 @@ class Descriptor(Part):
                 the sensor; ``cloud.viewpoint`` is None where that is neither known nor guessed.
         """
 
+    def again(self, cloud: PreparedCloud, before: Descriptor) -> Float32Array:
+        """The same of a cloud that holds the features of another descriptor, which may save work."""
+        return self(cloud)
+
 
 descriptor: Registry[Descriptor] = Registry("descriptor", "geomoe3d.features", lambda: Descriptor)
 """Decorator by which a descriptor joins, and the choice by name."""
 
 
-def with_features(cloud: PreparedCloud, describe: Descriptor) -> PreparedCloud:
+def with_features(
+    cloud: PreparedCloud, describe: Descriptor, before: Descriptor | None = None
+) -> PreparedCloud:
     """The cloud with the features of a descriptor.
+
+    Args:
+        cloud: preprocessed.
+        describe: the descriptor.
+        before: the one whose features the cloud holds, where they are known to be its; may save work.
 
     Raises:
         InputError: what the descriptor gives is not (n, dimension) finite numbers.
     """
-    features = np.ascontiguousarray(describe(cloud), dtype=np.float32)
+    found = describe(cloud) if before is None else describe.again(cloud, before)
+    features = np.ascontiguousarray(found, dtype=np.float32)
     if features.shape != (len(cloud), describe.dimension):
         raise InputError(
             f"the descriptor {type(describe).__name__} gives features of shape {features.shape} for {len(cloud)} "

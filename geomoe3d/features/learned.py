@@ -22,6 +22,7 @@ import numpy as np
 
 from geomoe3d.errors import CheckpointError
 from geomoe3d.features.base import Descriptor, descriptor
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.features.pyramid import FACTORS, Level, nearest, pyramid, relations
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, PreparedCloud
@@ -57,9 +58,15 @@ class LearnedDescriptor(Descriptor):
 
     def __call__(self, cloud: PreparedCloud) -> Float32Array:
         """See `Descriptor`."""
-        levels = pyramid(cloud)
+        return self._of(pyramid(cloud))
+
+    def again(self, cloud: PreparedCloud, before: Descriptor) -> Float32Array:
+        """See `Descriptor`; FPFH that is there is not computed again."""
+        return self._of(pyramid(cloud, cloud.features if before == FpfhDescriptor() else None))
+
+    def _of(self, levels: tuple[Level, ...]) -> Float32Array:
         if not levels[0].features.any():  # isolated points have nothing to go by
-            return np.zeros((len(cloud), DIMENSION), dtype=np.float32)
+            return np.zeros((len(levels[0]), DIMENSION), dtype=np.float32)
         with single_blas_thread():
             learned = _Network(self._tensors, levels).features()
         shares = np.sqrt(np.array([1 - _FPFH_SHARE, _FPFH_SHARE], dtype=np.float32))

@@ -51,15 +51,21 @@ class Level:
         return Level(*kept, self.edge)
 
 
-def pyramid(cloud: PreparedCloud) -> tuple[Level, ...]:
-    """The levels of a cloud of at least one point, finest first; see `FACTORS`."""
+def pyramid(cloud: PreparedCloud, fpfh: Float32Array | None = None) -> tuple[Level, ...]:
+    """The levels of a cloud of n >= 1 points, finest first; see `FACTORS`.
+
+    ``fpfh``: (n, 33) features of `FpfhDescriptor()` where somebody has them, which is most of the work.
+    """
     places = ((cloud.points - cloud.points.mean(0)) / cloud.voxel_size).astype(np.float32)
     normals = cloud.normals.astype(np.float32)
     levels = []
     for edge in FACTORS:
         rows = one_per_voxel(cloud, edge)
-        some = replace(cloud, points=cloud.points[rows], normals=cloud.normals[rows], features=None)
-        features = FpfhDescriptor(radius=5.0 * edge)(some)
+        if edge == 1 and fpfh is not None:
+            features = fpfh
+        else:
+            some = replace(cloud, points=cloud.points[rows], normals=cloud.normals[rows], features=None)
+            features = FpfhDescriptor(radius=5.0 * edge)(some)
         levels.append(Level(rows, places[rows], normals[rows], features, edge))
     return tuple(levels)
 

@@ -194,7 +194,7 @@ def _with_voxel_size(
 
 def _looked_at_once(config: RegistrationConfig) -> RegistrationConfig:
     """The configuration without second looks at doubtful pairs."""
-    look = {**config.second_look.model_dump(), "grids": (), "max_correspondences": 0}
+    look = {**config.second_look.model_dump(), "descriptor": "none", "grids": (), "max_correspondences": 0}
     return build_config(RegistrationConfig, {**config.model_dump(), "second_look": look})
 
 

@@ -193,8 +193,11 @@ def test_verbs_and_options_in_the_readme_exist():
     from geomoe3d.cli.register import command
 
     text = (ROOT / "README.md").read_text()
+    quickstart = (ROOT / "docs" / "quickstart.md").read_text()
     for verb in VERBS:
-        assert f"| `{verb}` | " in text
+        assert f"| `{verb}` | " in quickstart
+    assert len(re.findall(r"^\|[-|]+\|$", text, re.MULTILINE)) == 1  # one table
+    text += quickstart
     options = {option for parameter in command.params for option in parameter.opts}
     used = set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)", text))
     assert used <= options | {"--help"}

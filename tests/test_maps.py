@@ -9,7 +9,7 @@ import pytest
 from generated_buildings import GRID, first_room, other_room, scanned, view
 
 import geomoe3d
-from geomoe3d import Map
+from geomoe3d import Map, registration
 from geomoe3d.cli.errors import BAD_INPUT, OK, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.clouds.prepare import voxel_means
@@ -246,3 +246,17 @@ def test_a_laz_is_read_in_pieces(tmp_path):
     np.testing.assert_array_equal(
         np.concatenate(read), geomoe3d.load_points(tmp_path / "cloud.laz").file_points
     )
+
+
+# ---- register ------------------------------------------------------------------------------------------
+
+
+def test_register_seeks_the_small_cloud_in_the_large_one_whichever_comes_first(building, scan, monkeypatch):
+    points, true = scan
+    monkeypatch.setattr(registration, "_LARGER", 1.2)  # two rooms are not many
+    back = geomoe3d.register(building, points)
+    assert back.ok
+    assert "places" in back.seconds
+    assert shift(back.inverse().T_target_source, true) < 0.05
+    assert back.source.num_input == len(building)
+    assert back.num_inliers == back.inliers.sum() > 0

@@ -89,10 +89,17 @@ def choose_voxel_size(source: PointCloud, target: PointCloud, num_points: int) -
     Both clouds must have passed `check_cloud`.
     """
 
+    return float(f"{max(own_voxel_sizes(source, target, num_points)):.2g}")
+
+
+def own_voxel_sizes(source: PointCloud, target: PointCloud, num_points: int) -> tuple[float, float]:
+    """The voxel size that each of two clouds would get by itself, see `choose_voxel_size`; not rounded."""
+
     def of(cloud: PointCloud) -> float:
         return max(_size_for_count(cloud.points, num_points), 2.0 * typical_spacing(cloud.points))
 
-    return float(f"{max(each(of, (source, target))):.2g}")
+    first, second = each(of, (source, target))
+    return first, second
 
 
 def check_cloud(cloud: PointCloud) -> None:

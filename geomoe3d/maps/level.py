@@ -7,7 +7,7 @@ map's own principal directions. 200 bytes and some 60 microseconds per point.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,8 @@ import numpy as np
 from geomoe3d.clouds.prepare import drop_isolated, estimate_normals, voxel_means
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError
-from geomoe3d.features.base import with_features
+from geomoe3d.features.base import Descriptor, with_features
+from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.features.multiscale import MultiscaleDescriptor
 from geomoe3d.features.pyramid import one_per_voxel
 from geomoe3d.maps.facing import both_sides, facing_alike
@@ -102,16 +103,26 @@ class Level:
 
         return cKDTree(self.points)
 
-    def described(self, scan: PreparedCloud) -> tuple[IntArray, Float32Array]:
+    def described(self, scan: PreparedCloud, features: Float32Array) -> tuple[IntArray, Float32Array]:
         """Rows of a scan's points that are compared, as the map's, and their features (k, 32).
 
         Args:
             scan: on the level's grid, normals turned to its sensor.
+            features: (n, 99) of its points, by `MultiscaleDescriptor`.
         """
-        features = with_features(scan, MultiscaleDescriptor()).features
-        assert features is not None
         rows = one_per_voxel(scan, _SPACING)
         return rows, np.ascontiguousarray(features[rows] @ self.directions)
+
+
+def described_twice(scan: PreparedCloud, describe: Descriptor) -> tuple[PreparedCloud, Float32Array]:
+    """A scan with the features of a descriptor, and its (n, 99) of three reaches; plain FPFH is part of these."""
+    wide = with_features(scan, MultiscaleDescriptor()).features
+    assert wide is not None
+    if describe != FpfhDescriptor():
+        return with_features(scan, describe), wide
+    fine = wide[:, :33]
+    length = np.linalg.norm(fine, axis=1, keepdims=True)
+    return replace(scan, features=np.ascontiguousarray(fine / np.maximum(length, np.float32(1e-6)))), wide
 
 
 def _turned(points: FloatArray, normals: FloatArray, voxels: VoxelSums) -> tuple[FloatArray, BoolArray]:

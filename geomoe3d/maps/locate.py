@@ -17,27 +17,30 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import orient_normals
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import RegistrationConfig
+from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import judge, lead_over
 from geomoe3d.decision.scale import measure_scale
-from geomoe3d.decision.selection import Selection, are_different
+from geomoe3d.decision.selection import Selection
 from geomoe3d.features.base import with_features
-from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.geometry.se3 import inverse, motions_apart, transform_points
 from geomoe3d.maps.level import Level
 from geomoe3d.maps.places import Query
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import Float32Array, FloatArray, Hypothesis, PreparedCloud
 
-_WINDOWS, _MORE_WINDOWS = 10, 40
+_FIRST_WINDOWS, _WINDOWS, _MORE_WINDOWS = 6, 12, 40
+_PLAIN = 0.6  # a quick score that hardly any wrong motion reaches: no more windows are looked into
+_KEPT = 10  # distinct candidates
 _PER_WINDOW = 6
 _ASKED, _ASKED_BACK = 400, 800
 _LEAST_COSINE = 0.7
 _VIOLATION_WEIGHT = 10.0
-_DISTINCT_THRESHOLDS = 3.0
+_DISTINCT_THRESHOLDS, _MOST_TURN_DEG = 3.0, 15.0  # as in `geomoe3d.decision.selection`
 _CLOSE = 0.75  # of the best candidate's quick score: such places are looked at too
-_MARGIN = 10.0  # voxels around the scan's reach that are cut out with it: twice a feature's radius
+_MARGIN = 6.0  # voxels around the scan that are cut out of the map with it: a feature's radius and what it may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +62,20 @@ class Search:
     Args:
         line: parts of the configuration.
         scan: on the level's grid, with the features of the line.
+        features: (n, 99) of the scan's points, by `MultiscaleDescriptor`.
         level: of the map.
         part: of what is cut out of the map: its name, origin and counts; its arrays are replaced.
         clock: told of the stages.
     """
 
     def __init__(
-        self, line: Pipeline, scan: PreparedCloud, level: Level, part: PreparedCloud, clock: StageClock
+        self,
+        line: Pipeline,
+        scan: PreparedCloud,
+        features: Float32Array,
+        level: Level,
+        part: PreparedCloud,
+        clock: StageClock,
     ) -> None:
         self._line, self._level, self._part, self._clock = line, level, part, clock
         self.config: RegistrationConfig = line.config
@@ -74,8 +84,11 @@ class Search:
         self.eye = self.center if scan.viewpoint is None else scan.viewpoint
         reach = np.linalg.norm(scan.points - self.center, axis=1)
         self.reach = float(np.quantile(reach, 0.98))
+        self._apart = _DISTINCT_THRESHOLDS * self.config.estimator.inlier_threshold * scan.voxel_size
+        margin = _MARGIN * scan.voxel_size
+        self._box = scan.points.min(0) - margin, scan.points.max(0) + margin
         clock("places")
-        self._query = Query(scan, level, seed=self.config.seed)
+        self._query = Query(scan, features, level, seed=self.config.seed)
         rng = np.random.default_rng(self.config.seed)
         self._rows = np.sort(rng.permutation(len(scan))[:_ASKED])
         self._order = rng.permutation(len(level.points))
@@ -100,22 +113,27 @@ class Search:
         within = None if near is None else (near[0], near[1] + float(np.linalg.norm(self.eye - self.center)))
         windows = self._query.windows(_MORE_WINDOWS if more else _WINDOWS, within)
         self._clock("propose")
-        proposed = [h for window in windows for h in self._query.motions(window, _PER_WINDOW)]
-        if near is not None:
-            proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
-        proposed += [Hypothesis(T) for T in given]
-        scored = [(self._quick(h.T_target_source), h) for h in proposed]
+        scored = [(self._quick(T), Hypothesis(T)) for T in given]
+        for number, window in enumerate(windows):
+            if number >= _FIRST_WINDOWS and not more and max((q for q, _ in scored), default=0.0) > _PLAIN:
+                break
+            proposed = self._query.motions(window, _PER_WINDOW)
+            if near is not None:
+                proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
+            scored += [(self._quick(h.T_target_source), h) for h in proposed]
         scored.sort(key=lambda item: -item[0])
         chosen: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in scored:
+            if len(chosen) == _KEPT:
+                break
             if all(self.differ(hypothesis, other) for _, other in chosen):
                 chosen.append((score, hypothesis))
         return chosen
 
     def differ(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two motions are clearly different."""
-        shift = _DISTINCT_THRESHOLDS * self.config.estimator.inlier_threshold * self.scan.voxel_size
-        return are_different(a.T_target_source, b.T_target_source, self.scan, shift)
+        shift, turn = motions_apart(a.T_target_source, b.T_target_source, self.center)
+        return shift > self._apart or turn > _MOST_TURN_DEG
 
     def look(self, hypothesis: Hypothesis) -> Found:
         """The ordinary line on the scan and the map around where a motion puts it."""
@@ -156,8 +174,10 @@ class Search:
         if answer.note is not None:
             decision = decision.with_note(answer.note)
         self._clock("decide")
-        decision = decision.with_scale(measure_scale(decision.T_target_source, *best.pair.clouds))
-        return Found(best.pair, decision), distinct
+        T, pair = decision.T_target_source, best.pair
+        decision = decision.with_scale(measure_scale(T, *pair.clouds))
+        told = measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold)
+        return Found(pair, replace(decision, accuracy=told)), distinct
 
     def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
         return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]
@@ -183,7 +203,7 @@ class Search:
         return agreement * float(np.exp(-_VIOLATION_WEIGHT * violation))
 
     def _around(self, T: FloatArray) -> PreparedCloud:
-        """What the map holds within the scan's reach, turned to where the motion puts the scan's sensor."""
+        """What the map holds within the scan's box, turned to where the motion puts the scan's sensor."""
         level = self._level
         center, eye = transform_points(T, np.stack([self.center, self.eye]))
         rows = level.tree.query_ball_point(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from geomoe3d.clouds.prepare import (
     bounded_voxel_size,
     check_cloud,
     choose_voxel_size,
+    prepare,
     robust_extent,
     typical_spacing,
 )
@@ -27,7 +29,7 @@ from geomoe3d.decision.answer import failed_result, finished_result
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.se3 import check_motion, motions_apart, shift_frames, transform_points
-from geomoe3d.maps.level import Level
+from geomoe3d.maps.level import Level, described_twice
 from geomoe3d.maps.locate import Found, Search, likely
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.store import Source, load, save
@@ -41,6 +43,7 @@ _MOST_VOXELS = 1_000_000
 _PIECE = 1_000_000
 _NEAR_SIZE = 1.3  # a level whose voxels are so many times as large or small as the scan's own serves it
 _CANDIDATES = 4
+NOWHERE = "no place in the map was found at which the scan could lie"
 _LARGER = 3.0  # times the map's extent from which a scan is no part of it
 
 
@@ -113,11 +116,12 @@ class Map:
         *,
         config: RegistrationConfig | None = None,
         name: str = "map",
+        line: Pipeline | None = None,
     ) -> None:
         self._voxels, self._levels = voxels, levels
         self.sources, self.name = sources, name
         self.config = resolved(config)
-        self._line: Pipeline | None = None
+        self._line = line
 
     @classmethod
     def empty(cls, *, config: RegistrationConfig | None = None, **overrides: Any) -> Map:
@@ -213,14 +217,14 @@ class Map:
         for points in read.points():
             moved = points if T_map_cloud is None else transform_points(T, points)
             if not len(voxels):
-                voxels = _first(moved, read.name)
+                voxels = _first(moved, read.name, read.origin if T_map_cloud is None else None)
             voxels = voxels.added(moved, place)
             while len(voxels) > _MOST_VOXELS:
                 voxels = voxels.coarser()
             count += len(points)
         name = self.name if self.sources else read.name
         sources = (*self.sources, Source(read.name, read.sha256, count))
-        return Map(voxels, (), sources, config=self.config, name=name)
+        return Map(voxels, (), sources, config=self.config, name=name, line=self._line)
 
     def describe(self, voxel_size: float | None = None, *, progress: Progress | None = None) -> None:
         """Describe the map on a grid now, so that the first scan need not wait for it.
@@ -290,45 +294,66 @@ class Map:
         refused = self._refused(cloud)
         if refused is not None:
             return self._nowhere(cloud, refused, clock)
-        clock("prepare")
-        preparation = self.config.preparation
-        wanted = self.config.voxel_size or choose_voxel_size(cloud, cloud, preparation.voxel_points)
-        level = self._level(bounded_voxel_size(cloud, cloud, wanted, preparation.max_points))
-        view = find_viewpoints(cloud, cloud, preparation.viewpoint)[0]
-        described = self._pipeline.prepare(cloud, level.voxel_size, view, clock)
-        search = Search(self._pipeline, described, level, self._part(level), clock)
-        to_local = [shift_frames(T, -cloud.origin, -self._voxels.origin) for T in guesses]
         local = None if asked is None else (asked[0] - self._voxels.origin, asked[1])
-        found: list[Found] = []
-        best: Found | None = None
-        ranked: list[Hypothesis] = []
-        for more, where in self._rounds(local):
-            candidates = search.candidates(more=more, near=where, given=to_local)
-            found += [search.look(h) for h in likely(candidates, max(k, _CANDIDATES))]
-            if not found:
-                continue
-            best, ranked = search.decide(found)
-            if best.decision.judgement.status == "ok":
-                break
+        best, ranked = self._search(cloud, scan, guesses, local, max(k, _CANDIDATES), clock)
         if best is None or best.decision.answer is None:
-            return self._nowhere(cloud, "no place in the map was found at which the scan could lie", clock)
-        decision = best.decision
-        for sentence in (
-            *cloud.notes,
-            *self._prior_notes(search, ranked[0].T_target_source, local, to_local),
-        ):
-            decision = decision.with_note(sentence)
-        given = (scan, self.name), best.pair.clouds, min(wanted, level.voxel_size), view is not None
-        for sentence in remarks(*given, preparation, decision.judgement):
-            decision = decision.with_note(sentence)
-        result = finished_result(best.pair, decision, self.config, clock.stop())
-        origins = cloud.origin, self._voxels.origin
-        top = decision.answer.score if decision.answer is not None else 0.0
+            return self._nowhere(cloud, NOWHERE, clock)
+        result = finished_result(best.pair, best.decision, self.config, clock.stop())
+        origins, top = (cloud.origin, self._voxels.origin), best.decision.answer.score
         places = tuple(
             Place(shift_frames(h.T_target_source, *origins), h.score / top if top > 0 else 1.0)
             for h in ranked[:k]
         )
         return Location(result, places)
+
+    def _search(
+        self,
+        cloud: PointCloud,
+        given: Any,
+        guesses: Sequence[FloatArray],
+        near: tuple[FloatArray, float] | None,
+        count: int,
+        clock: StageClock,
+    ) -> tuple[Found | None, list[Hypothesis]]:
+        """What was decided of a scan, None without any candidate, and the distinct answers, best first.
+
+        Args:
+            cloud: the scan, as loaded.
+            given: the same as the caller gave it.
+            guesses: (4, 4) of T_map_scan, file coordinates.
+            near: as of `Search.candidates`.
+            count: places that are looked at closely, at most.
+            clock: told of the stages.
+        """
+        clock("prepare")
+        preparation = self.config.preparation
+        wanted = self.config.voxel_size or choose_voxel_size(cloud, cloud, preparation.voxel_points)
+        level = self._level(bounded_voxel_size(cloud, cloud, wanted, preparation.max_points))
+        view = find_viewpoints(cloud, cloud, preparation.viewpoint)[0]
+        bare = prepare(cloud, level.voxel_size, preparation, viewpoint=view, seed=self.config.seed)
+        clock("features")
+        described, wide = described_twice(bare, self._pipeline.descriptor)
+        search = Search(self._pipeline, described, wide, level, self._part(level), clock)
+        local = [shift_frames(T, -cloud.origin, -self._voxels.origin) for T in guesses]
+        found: list[Found] = []
+        best: Found | None = None
+        ranked: list[Hypothesis] = []
+        for more, where in self._rounds(near):
+            candidates = search.candidates(more=more, near=where, given=local)
+            found += [search.look(h) for h in likely(candidates, count)]
+            if found:
+                best, ranked = search.decide(found)
+                if best.decision.judgement.status == "ok":
+                    break
+        if best is None or best.decision.answer is None:
+            return None, []
+        decision = best.decision
+        read = (given, self.name), best.pair.clouds, min(wanted, level.voxel_size), view is not None
+        told_of = remarks(*read, preparation, decision.judgement)
+        prior = self._prior_notes(search, decision.T_target_source, near, local)
+        for sentence in (*cloud.notes, *prior, *told_of):
+            decision = decision.with_note(sentence)
+        return replace(best, decision=decision), ranked
 
     @property
     def _pipeline(self) -> Pipeline:
@@ -415,11 +440,11 @@ def _with(config: RegistrationConfig | None, overrides: dict[str, Any]) -> Regis
     return build_config(RegistrationConfig, {**tree, **overrides}, "Map(...)")
 
 
-def _first(points: FloatArray, name: str) -> VoxelSums:
+def _first(points: FloatArray, name: str, origin: FloatArray | None) -> VoxelSums:
     """An empty grid that suits the first points of a map: at least twice their typical spacing."""
     cloud = PointCloud(points, name=name)
     check_cloud(cloud)
-    origin = choose_origin(points)
+    origin = choose_origin(points) if origin is None else origin
     spacing = 2 * typical_spacing(points - origin)
     edge = max(spacing, robust_extent(points) / 10_000)
     if not edge > 0:
@@ -440,3 +465,26 @@ def _near(near: ArrayLike | None, within: float | None, k: int) -> tuple[FloatAr
     if not (math.isfinite(within) and within > 0):
         raise InputError(f"within is {within}, expected a positive length")
     return place, float(within)
+
+
+def search_larger(
+    scan: PointCloud, world: PointCloud, line: Pipeline, guess: FloatArray | None, clock: StageClock
+) -> Found | None:
+    """One cloud sought in a much larger one: what `geomoe3d.registration` does with such a pair.
+
+    Args:
+        scan: the smaller cloud, as loaded.
+        world: the larger one, as loaded; its sensor is not asked for.
+        line: parts of the configuration.
+        guess: (4, 4) of T_world_scan, file coordinates, or None.
+        clock: told of the stages.
+
+    Returns:
+        The scan and the part of the larger cloud around the answer, in the clouds' local coordinates, and what was
+        decided; None where there was no candidate.
+    """
+    clock("index")
+    nothing = VoxelSums.empty(1.0, np.zeros(3))
+    made = Map(nothing, config=line.config, line=line).with_cloud(replace(world, sensor=None))
+    guesses = [] if guess is None else [guess]
+    return made._search(scan, scan, guesses, None, _CANDIDATES, clock)[0]

@@ -28,12 +28,14 @@ class Pieces:
         sha256: of the file, or of the points of a cloud in memory.
         points: gives its finite points (n, 3) in file coordinates, piece by piece.
         sensor: (3,) where the file says that its one sensor stood, file coordinates, or None.
+        origin: (3,) of the local coordinates of a cloud that was read at once, else None.
     """
 
     name: str
     sha256: str
     points: Callable[[], Iterator[FloatArray]]
     sensor: FloatArray | None = None
+    origin: FloatArray | None = None
 
 
 def pieces(cloud: Any, size: int) -> Pieces:
@@ -59,7 +61,7 @@ def pieces(cloud: Any, size: int) -> Pieces:
         for start in range(0, len(loaded), size):
             yield loaded.points[start : start + size] + loaded.origin
 
-    return Pieces(loaded.name, digest, parts, loaded.sensor)
+    return Pieces(loaded.name, digest, parts, loaded.sensor, loaded.origin)
 
 
 def _finite(path: Path, size: int) -> Iterator[FloatArray]:

@@ -53,12 +53,13 @@ class Query:
 
     Args:
         scan: on the level's grid, normals turned to its sensor.
+        features: (n, 99) of its points, by `MultiscaleDescriptor`.
         level: of the map.
         seed: decides which points are asked.
     """
 
-    def __init__(self, scan: PreparedCloud, level: Level, *, seed: int = 0) -> None:
-        rows, features = level.described(scan)
+    def __init__(self, scan: PreparedCloud, features: Float32Array, level: Level, *, seed: int = 0) -> None:
+        rows, features = level.described(scan, features)
         chosen = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_ASKED])
         self.level, self.seed = level, seed
         self.points, self.normals = scan.points[rows[chosen]], scan.normals[rows[chosen]]
@@ -127,7 +128,7 @@ class Query:
             normals_signed=True,
         )
         threshold = _THRESHOLD * level.voxel_size
-        return ConsensusEstimator(num_hypotheses=count, num_seeds=400, num_refined=60)(
+        return ConsensusEstimator(num_hypotheses=count, num_seeds=250, num_refined=30)(
             matched.points,
             np.where(mutual[order], 1.0, 0.5),
             inlier_threshold=threshold,

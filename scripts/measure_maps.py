@@ -1,0 +1,217 @@
+"""Scans in maps: one room, three rooms side by side, scans of another building; peers beside.
+
+    python scripts/measure_maps.py OUT [--cases room three stranger] [--methods geomoe3d kiss-matcher
+        open3d-feature-ransac] [--every 1]
+
+The rooms are three dev scenes of 3DMatch, each merged by its published poses; 60 fragments are asked for, 20 of each.
+They are left out in five turns: a map holds none of the twelve fragments asked for in its turn. Side by side the rooms
+stand 12 m apart (34 m, 3 million points). Strangers are the fragments of a fourth scene, sought in the three rooms.
+Peers register the same clouds on the grid of geomoe3d. Right: within 15 degrees and 30 cm. One line per query goes to
+OUT/queries.jsonl; what is there is not done again; `--every N` asks for every Nth query. The map's time is that of
+`Map.from_cloud`, once per turn; a query's is that of `Map.locate`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.clouds.io import load_points
+from geomoe3d.data.threedmatch import BENCHMARKS, find_benchmark_root, load_benchmark
+from geomoe3d.evaluation.intervals import wilson
+from geomoe3d.evaluation.metrics import is_right, motion_errors
+from geomoe3d.evaluation.peers import PEERS
+from geomoe3d.evaluation.records import MethodInput
+from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.maps.map import Map
+from geomoe3d.runtime.journal import Journal, read_journal
+from geomoe3d.types import FloatArray
+
+OURS = "geomoe3d"
+METHODS = (OURS, "kiss-matcher", "open3d-feature-ransac")
+CASES = ("room", "three", "stranger")
+APART, PER_SCENE, TURNS = 12.0, 20, 5
+GRID = 0.055  # of the peers; geomoe3d describes these maps on it
+
+
+@dataclass(frozen=True)
+class Query:
+    """One scan sought in one map; ``truth`` T_map_scan, or None where it lies nowhere in it."""
+
+    case: str
+    scene: str
+    number: int
+    turn: int
+    truth: FloatArray | None
+
+    @property
+    def key(self) -> str:
+        """What the query is called in the journal."""
+        return f"{self.case}/{self.scene}/{self.number}"
+
+
+class Scenes:
+    """The fragments of the dev scenes, and where they lie."""
+
+    def __init__(self) -> None:
+        self._folder = find_benchmark_root() / "fragments"
+        self.names = sorted(path.name for path in self._folder.iterdir())
+        self._poses = {name: _poses(name) for name in self.names}
+
+    def points(self, scene: str, number: int) -> FloatArray:
+        """(N, 3) of a fragment, its sensor at the origin."""
+        return load_points(self._folder / scene / f"cloud_bin_{number}.ply").file_points
+
+    def numbers(self, scene: str) -> list[int]:
+        """Of its fragments whose place is known."""
+        return sorted(self._poses[scene])
+
+    def pose(self, scene: str, number: int) -> FloatArray:
+        """(4, 4) T_map_fragment, the scenes side by side."""
+        T: FloatArray = self._poses[scene][number].copy()
+        T[0, 3] += APART * self.names.index(scene)
+        return T
+
+    def asked(self, scene: str) -> list[int]:
+        """The fragments that are asked for, evenly over the scene."""
+        numbers = self.numbers(scene)
+        return [numbers[k] for k in np.linspace(0, len(numbers) - 1, PER_SCENE).round().astype(int)]
+
+    def merged(self, scenes: list[str], turn: int) -> FloatArray:
+        """(N, 3) of some scenes without what is asked for in a turn."""
+        parts = []
+        for scene in scenes:
+            out = self.asked(scene)[turn::TURNS]
+            parts += [
+                transform_points(self.pose(scene, number), self.points(scene, number))
+                for number in self.numbers(scene)
+                if number not in out
+            ]
+        return np.concatenate(parts)
+
+
+def _poses(scene: str) -> dict[int, FloatArray]:
+    """T_world_fragment (4, 4) along as few published motions as possible."""
+    motions: dict[int, list[tuple[int, FloatArray]]] = {}
+    for benchmark in BENCHMARKS:
+        for pair in load_benchmark(None, benchmark):
+            if pair.scene == scene:
+                i, j, T = pair.source_index, pair.target_index, pair.T_target_source
+                motions.setdefault(i, []).append((j, inverse(T)))
+                motions.setdefault(j, []).append((i, T))
+    first = max(motions, key=lambda number: len(motions[number]))
+    found, queue = {first: np.eye(4)}, deque([first])
+    while queue:
+        known = queue.popleft()
+        for other, T_known_other in motions[known]:
+            if other not in found:
+                found[other] = found[known] @ T_known_other
+                queue.append(other)
+    return found
+
+
+def maps(scenes: Scenes, cases: list[str]) -> Iterator[tuple[str, int, list[str], list[Query]]]:
+    """Case, turn, the rooms of the map, and the scans sought in it."""
+    rooms = scenes.names[:3]
+    for turn in range(TURNS):
+        asked = {scene: scenes.asked(scene)[turn::TURNS] for scene in rooms}
+        if "room" in cases:
+            for scene in rooms:
+                queries = [Query("room", scene, n, turn, scenes.pose(scene, n)) for n in asked[scene]]
+                yield "room", turn, [scene], queries
+        if "three" in cases:
+            queries = [Query("three", s, n, turn, scenes.pose(s, n)) for s in rooms for n in asked[s]]
+            yield "three", turn, rooms, queries
+        if "stranger" in cases:
+            other = scenes.names[3]
+            queries = [Query("stranger", other, n, turn, None) for n in scenes.numbers(other)[turn::TURNS]]
+            yield "stranger", turn, rooms, queries
+
+
+def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Map | None) -> dict[str, Any]:
+    """What a method says of one query, as a line of the journal."""
+    begin = time.perf_counter()
+    line: dict[str, Any] = {}
+    if made is not None:
+        found = made.locate(scan)
+        T: FloatArray | None = found.T_map_scan
+        line = {"status": found.status, "confidence": found.result.confidence}
+        places = [place.T_map_scan for place in found.places]
+    else:
+        given = MethodInput(query.key, source=scan, target=world, voxel_size=GRID, inlier_threshold=2 * GRID)
+        T = PEERS[method](given).T_target_source
+        places = []
+    line["seconds"] = time.perf_counter() - begin
+    if query.truth is not None:
+        line["right"] = is_right(*motion_errors(T, query.truth))
+        line["among"] = any(is_right(*motion_errors(place, query.truth)) for place in places)
+    return line
+
+
+def report(lines: list[dict[str, Any]]) -> None:
+    """The table: counts with Wilson's intervals and the median time."""
+    for case, method in sorted({(line["case"], line["method"]) for line in lines}):
+        of = [line for line in lines if (line["case"], line["method"]) == (case, method)]
+        count, words = len(of), []
+        sure = [line for line in of if line.get("status") == "ok"]
+        wrong = sum(not line.get("right", False) for line in sure)
+        for name, number in (
+            ("right", sum(line.get("right", False) for line in of) if case != "stranger" else None),
+            ("ok", len(sure) if method == OURS else None),
+            ("wrong ok", wrong if method == OURS else None),
+        ):
+            if number is not None:
+                low, high = wilson(number / count, count)
+                words.append(f"{name} {number} ({100 * number / count:.1f} %, {low:.1f} to {high:.1f})")
+        seconds = statistics.median(line["seconds"] for line in of)
+        print(f"{case:9} {method:22} of {count}: {', '.join(words)}; median {seconds:.2f} s")
+    indexed = [line["index_seconds"] for line in lines if "index_seconds" in line]
+    if indexed:
+        print(f"maps described: median {statistics.median(indexed):.1f} s, longest {max(indexed):.1f} s")
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--every", type=int, default=1)
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "queries.jsonl"
+    done = {(line["key"], line["method"]) for line in read_journal(path)}
+    scenes = Scenes()
+    with Journal(path) as journal:
+        for case, turn, rooms, queries in maps(scenes, options.cases):
+            chosen = queries[:: options.every]
+            open_ones = [(q, m) for q in chosen for m in options.methods if (q.key, m) not in done]
+            if not open_ones:
+                continue
+            world = scenes.merged(rooms, turn)
+            made, indexed = None, 0.0
+            if any(method == OURS for _, method in open_ones):
+                begin = time.perf_counter()
+                made = Map.from_cloud(world)
+                indexed = time.perf_counter() - begin
+            for query, method in open_ones:
+                scan = scenes.points(query.scene, query.number)
+                line = ask(method, query, scan, world, made if method == OURS else None)
+                head = {"key": query.key, "case": case, "method": method}
+                if method == OURS:
+                    head["index_seconds"] = indexed
+                journal.append({**head, **line})
+                print(f"{query.key} {method}: {line}", flush=True)
+    report(list(read_journal(path)))
+
+
+if __name__ == "__main__":
+    main()

@@ -170,6 +170,8 @@ class Search:
         )
         information = best.decision.information
         judgement = judge(answer, rival, lead, support, information, self.config.decision, len(matched))
+        if judgement.status == "ok":  # never where it was not sure before it had rivals
+            judgement = best.decision.judgement
         decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
         if answer.note is not None:
             decision = decision.with_note(answer.note)

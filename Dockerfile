@@ -21,6 +21,7 @@ RUN apt-get update \
  && apt-get install --yes --no-install-recommends $(python -m geomoe3d.doctor --apt) \
  && rm -rf /var/lib/apt/lists/*
 
+ENV HOME=/tmp
 WORKDIR /data
 USER 65534:65534
 ENTRYPOINT ["geomoe3d"]

@@ -4,7 +4,7 @@
 #     bash scripts/matrix.sh [--lowest | --newest] [--without-torch] PYTHON...
 #
 # Builds the wheel; makes an environment for each PYTHON (such as python3.12), installs the wheel there, runs the
-# README's commands in an empty folder, then the tests of files, registration, results and pictures. --without-torch
+# README's commands in an empty folder, then the tests of files, registration and results. --without-torch
 # leaves PyTorch out, as the classical path allows. Ends with a line per interpreter; exit code 1 if one failed.
 set -euo pipefail
 checkout=$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd)
@@ -44,9 +44,9 @@ for line in lines:
 PYTHON
 }
 
-tests=(test_formats_ply test_formats_pcd test_formats_text test_formats_arrays test_formats_scans test_loading test_saving
-  test_transform_files test_consensus test_registration test_result test_cli_register test_visual_picture
-  test_visual_sheet test_batch test_sample)
+tests=(test_formats_ply test_formats_pcd test_formats_text test_formats_arrays test_formats_scans test_formats_las
+  test_formats_e57 test_loading test_saving test_transform_files test_registration test_result test_cli_register
+  test_visual_sheet)
 files=("${tests[@]/#/$checkout/tests/}")
 files=("${files[@]/%/.py}")
 report=()
@@ -61,7 +61,8 @@ for interpreter in "$@"; do
   requirements "$venv/bin/python" >"$work/needs.txt"
   said=ok
   {
-    "$venv/bin/pip" -q install "${constraint[@]}" -r "$work/needs.txt" pytest pytest-timeout hypothesis &&
+    "$venv/bin/pip" -q install "${constraint[@]}" -r "$work/needs.txt" pytest pytest-timeout hypothesis \
+      "laspy[lazrs]" pye57 &&
       "$venv/bin/pip" -q install --no-deps "$wheel" &&
       mkdir "$work/empty-$name" && cd "$work/empty-$name" &&
       "$venv/bin/geomoe3d" sample sample &&

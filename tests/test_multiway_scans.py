@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.prepare import voxel_keys
 from geomoe3d.config import PreparationConfig
+from geomoe3d.data.sample import write_sample_pair
+from geomoe3d.errors import FormatError
 from geomoe3d.multiway.scans import choose_common_voxel_size, find_scans
 
 
@@ -16,6 +19,16 @@ def test_scans_are_found_in_natural_order_with_unique_names(tmp_path):
         (tmp_path / name).write_text("")
     assert [scan.name for scan in find_scans([tmp_path / "a"])] == ["s9", "s10"]
     assert [s.name for s in find_scans([tmp_path / "a", tmp_path / "b"])] == ["a/s9", "a/s10", "b/s9"]
+
+
+def test_transforms_beside_the_scans_are_no_scans(tmp_path):
+    write_sample_pair(tmp_path)
+    assert (tmp_path / "T_target_source.txt").is_file()
+    np.save(tmp_path / "T.npy", np.eye(4))
+    assert [scan.name for scan in find_scans([tmp_path])] == ["source", "target"]
+    for name in ("T_target_source.txt", "T.npy"):
+        with pytest.raises(FormatError, match="holds a transform"):
+            load_points(tmp_path / name)
 
 
 def test_the_common_voxel_size_serves_the_median_scan(scanned_room):

@@ -13,8 +13,11 @@ import numpy as np
 from geomoe3d.batch.table import kind_of
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size
+from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
+
+_LARGEST_TRANSFORM = 4096  # bytes
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ def find_scans(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
 def find_clouds(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
     """The clouds of given files and folders, in natural order (scan 2 before scan 10) within each folder.
 
-    A folder stands for all files in it that can be read as clouds, not for its sub-folders.
+    A folder stands for all files in it that can be read as clouds, not for its sub-folders nor for transforms that
+    lie beside them.
 
     Raises:
         InputError: a path that is not there, a folder without clouds, or a file given twice.
@@ -77,6 +81,7 @@ def find_clouds(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
         path = Path(given)
         if path.is_dir():
             inside = [p for p in path.iterdir() if p.suffix.lower() in READABLE_SUFFIXES and p.is_file()]
+            inside = [p for p in inside if not _is_transform(p)]
             if not inside:
                 raise InputError(f"'{path}' holds no clouds; readable are {', '.join(READABLE_SUFFIXES)}")
             paths += sorted(inside, key=lambda p: natural_key(p.name))
@@ -89,6 +94,16 @@ def find_clouds(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
     if twice:
         raise InputError(f"'{sorted(twice)[0]}' is given more than once; name every scan once")
     return [Scan(name, str(path)) for name, path in zip(_unique_names(resolved), resolved, strict=True)]
+
+
+def _is_transform(path: Path) -> bool:
+    if path.stat().st_size > _LARGEST_TRANSFORM:
+        return False
+    try:
+        load_transform(path)
+    except GeoMoE3DError:
+        return False
+    return True
 
 
 def choose_common_voxel_size(

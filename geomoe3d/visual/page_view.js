@@ -120,6 +120,7 @@ class Camera {
       const [[left, right], [low, high]] = [middle(u), middle(v)], before = this.distance;
       this.center = this.center.map((c, k) => c + before / 2 * ((left + right) * across[k] + (low + high) * above[k]));
       this.distance *= Math.max((right - left) / (2 * half * aspect), (high - low) / (2 * half), 0.05);
+      this.distance = Math.max(this.distance, 2.2 * radius); // from nearer, what is in front looks huge
     }
   }
 

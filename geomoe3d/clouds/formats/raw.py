@@ -156,9 +156,11 @@ def split_columns(
         naming: how its columns can be named, in messages.
 
     Raises:
-        FormatError: no names, and the first column counts the rows like a point number.
+        FormatError: no names, and the first column counts the rows like a point number, or it is a transform.
     """
     if names is None:
+        if table.shape == (4, 4) and table[3].tolist() == [0, 0, 0, 1]:
+            raise FormatError(f"{what} holds a transform, four rows of four numbers, and no points")
         if _counts_rows(table):
             raise FormatError(
                 f"{what}: the first column rises in whole numbers from {table[0, 0]:.0f} to "

@@ -276,7 +276,7 @@ def test_nothing_is_cut_off_on_a_phone_or_elsewhere(tmp_path, window):
         depth = (distance + at @ look) * np.tan(np.radians(20))
         shown = np.abs(np.stack([at @ across / (depth * width / height), at @ above / depth]))
         assert np.mean(shown.max(axis=0) > 1) < 0.005, side
-        assert shown.max(axis=1).max() > 0.7, side  # and it fills the stage
+        assert shown.max(axis=1).max() > 0.5, side  # and it fills the stage
 
 
 def test_lengths_have_the_name_of_their_unit():

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 OURS = [DOCS / "quickstart.md", *sorted(DOCS.glob("how-to/*.md"))]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
-STILL_LONG = {"benchmark", "measurements", "network", "training"}
+STILL_LONG = {"measurements"}
 """Pages whose paragraphs are laid out anew when nobody is writing in them."""
 
 

@@ -164,6 +164,7 @@ def register_scans(
     if page:
         from geomoe3d.multiway.page import save_model_page
 
+        clock("draw the page")
         save_model_page(model, folder / PAGE_FILE)
     return replace(model, seconds=clock.stop())
 

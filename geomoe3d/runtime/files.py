@@ -7,6 +7,7 @@ same folder, so that a reader, a full disk or an interrupt never meets half a fi
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Callable
@@ -33,6 +34,8 @@ def check_output(path: str | os.PathLike[str], *, force: bool) -> Path:
     try:
         if path.is_symlink():
             path = path.resolve()
+            if path.is_symlink():  # as Python says from 3.13 on
+                raise OSError(errno.ELOOP, "symbolic links in a loop")
         if path.is_dir():
             raise OutputError(f"cannot write '{path}': it is a folder; give a file name inside it")
         folder = path.parent

@@ -19,6 +19,7 @@ from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import InputError
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import residuals, shift_frames
 from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.runtime.threads import single_blas_thread
@@ -164,7 +165,7 @@ class CorrespondenceRegistrar:
         if not found:
             return [], FilterOutput(np.zeros(len(matched)))
         clock("score")
-        few = likeliest_rows(matched, MOST_ROWS, pair.seed)
+        few = likeliest_rows(matched, MOST_ROWS, pair.inlier_threshold, pair.seed)
         surfaces = pair.keypoint_surfaces if few is matched else None
         aligner = KeypointAligner(matched.points, pair.inlier_threshold, surfaces)
         say = network.about(pair if few is matched else replace(pair, matched=few))
@@ -248,17 +249,15 @@ def _verdict(hypothesis: Hypothesis) -> float:
     return -np.inf if opinion is None else opinion.verdict
 
 
-def likeliest_rows(correspondences: Correspondences, limit: int, seed: int) -> Correspondences:
-    """At most ``limit`` correspondences in their order: mutual ones first, a seeded choice among equals.
+def likeliest_rows(correspondences: Correspondences, limit: int, cell: float, seed: int) -> Correspondences:
+    """At most ``limit`` correspondences in their order: mutual ones first, a seeded choice among equals, by cells.
 
     The same object where there are no more.
     """
     if len(correspondences) <= limit:
         return correspondences
-    chosen = np.random.default_rng(seed).permutation(len(correspondences))
-    if correspondences.mutual is not None:
-        chosen = chosen[np.argsort(~correspondences.mutual[chosen], kind="stable")]
-    return correspondences.take(np.sort(chosen[:limit]))
+    points, mutual = correspondences.points, correspondences.mutual
+    return correspondences.take(drawn_rows(points, cell, limit, seed, first=mutual))
 
 
 def check_rows(correspondences: ArrayLike | Correspondences) -> FloatArray:

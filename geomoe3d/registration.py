@@ -15,17 +15,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.order import in_order
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import (
     bounded_voxel_size,
     check_cloud,
     own_voxel_sizes,
     robust_extent,
+    round_size,
     scale_mismatch,
 )
 from geomoe3d.clouds.viewpoint import MOST_SIGN_BREAKS, find_viewpoints, known_viewpoints, sign_breaks
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.correspondence_registration import CorrespondenceRegistrar, between_clouds
+from geomoe3d.correspondence_registration import CorrespondenceRegistrar, between_clouds, check_rows
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.confidence import Judgement
@@ -33,7 +35,7 @@ from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.decision.scale import likely_unit_ratio, measure_scale, seeming_units
 from geomoe3d.decision.selection import Selection
-from geomoe3d.errors import ConfigError, InputError
+from geomoe3d.errors import ConfigError, EmptyCloudError, InputError
 from geomoe3d.features.cache import FeatureCache
 from geomoe3d.geometry.se3 import check_motion, inverse
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides, resolved, with_weights
@@ -41,7 +43,7 @@ from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
-from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud
+from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, PointCloud
 
 _LARGER = 3.0
 """Ratio of the voxel sizes that two clouds would get by themselves from which the larger is taken for a map; of 1,941
@@ -164,18 +166,42 @@ class Registrar:
         clouds = _load(source, "source", seed), _load(target, "target", seed)
         for cloud in clouds:
             check_cloud(cloud)
+        rows = None if correspondences is None else check_rows(correspondences)
+        guess = None if initial is None else check_motion(initial)
         mismatch = scale_mismatch(*clouds)
         if mismatch is not None:
             reason = self._units(clouds, clock) or mismatch
             failed = failed_result(clouds, reason, config, clock.stop())
             return Explanation(failed, *clouds).remembering(source, target)
+        exchanged = not in_order(*clouds)
+        if exchanged:
+            clouds = clouds[1], clouds[0]
+            guess = None if guess is None else inverse(guess)
+            rows = None if rows is None else np.roll(rows, 3, axis=1)
+        found = self._explained((source, target), clouds, clock, guess, rows, exchanged)
+        return (found.exchanged() if exchanged else found).remembering(source, target)
+
+    def _explained(
+        self,
+        data: tuple[Any, Any],
+        clouds: tuple[PointCloud, PointCloud],
+        clock: StageClock,
+        initial: FloatArray | None,
+        correspondences: FloatArray | None,
+        exchanged: bool,
+    ) -> Explanation:
+        """`explain` for clouds in the order of the line; ``exchanged``: the caller calls the second one the source."""
+        config = self.config
         clock("prepare")
         wanted = config.voxel_size
         if wanted is None:
             sizes = own_voxel_sizes(*clouds, config.preparation.voxel_points)
             if correspondences is None and self._is_map(sizes):
-                return self._in_map(clouds, (source, target), sizes[0] > sizes[1], initial, clock)
-            wanted = float(f"{max(sizes):.2g}")
+                if sizes[0] <= sizes[1]:
+                    return self._in_map(clouds, initial, clock)
+                back = None if initial is None else inverse(initial)
+                return self._in_map(clouds[::-1], back, clock).exchanged()
+            wanted = round_size(max(sizes))
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         views = find_viewpoints(*clouds, config.preparation.viewpoint)
         prepared = self.pipeline.prepare_both(clouds, voxel_size, views, clock)
@@ -195,14 +221,17 @@ class Registrar:
                 pair, weighed, decision = other
         clock("decide")
         if decision.answer is not None:
-            decision = decision.with_scale(measure_scale(decision.T_target_source, *pair.clouds))
+            scale = measure_scale(decision.T_target_source, *pair.clouds)
+            decision = decision.with_scale(scale, exchanged=exchanged)
             told = measure_accuracy(
                 decision.T_target_source, *pair.clouds, pair.matched, pair.inlier_threshold
             )
             decision = replace(decision, accuracy=told)
-        if decision.judgement.status != "ok" and (units := self._units(clouds, clock)) is not None:
-            decision = decision.with_note(units, first=True)
-        read = (source, target), pair.clouds, wanted, places is not None
+        if decision.judgement.status != "ok":
+            units = self._units(clouds[::-1] if exchanged else clouds, clock)
+            if units is not None:
+                decision = decision.with_note(units, first=True)
+        read = data, pair.clouds, wanted, places is not None
         told_of = remarks(*read, config.preparation, decision.judgement)
         for remark in (*clouds[0].notes, *clouds[1].notes, *told_of):
             decision = decision.with_note(remark)
@@ -212,32 +241,23 @@ class Registrar:
             weighed = said or FilterOutput(np.zeros(len(pair.matched)))
         result = finished_result(pair, decision, config, clock.stop())
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
-        found = Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
-        return found.remembering(source, target)
+        return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
     def _is_map(self, sizes: tuple[float, float]) -> bool:
         """Whether one cloud is so much larger or sparser than the other that what both share is a small part of it."""
         return max(sizes) >= _LARGER * min(sizes) and bool(self.pipeline.scorers)
 
     def _in_map(
-        self,
-        clouds: tuple[PointCloud, PointCloud],
-        given: tuple[Any, Any],
-        exchanged: bool,
-        initial: ArrayLike | None,
-        clock: StageClock,
+        self, clouds: tuple[PointCloud, PointCloud], guess: FloatArray | None, clock: StageClock
     ) -> Explanation:
-        """The smaller cloud sought in the larger one; ``exchanged``: the source is the larger."""
+        """The first cloud sought in the second, much larger one."""
         from geomoe3d.maps.map import NOWHERE, search_larger
 
-        scan, world = clouds[::-1] if exchanged else clouds
-        guess = None if initial is None else check_motion(initial)
-        if guess is not None and exchanged:
-            guess = inverse(guess)
+        scan, world = clouds
         found = search_larger(scan, world, self.pipeline, guess, clock)
         if found is None or found.decision.answer is None:
             failed = failed_result(clouds, NOWHERE, self.config, clock.stop())
-            return Explanation(failed, *clouds).remembering(*given)
+            return Explanation(failed, *clouds)
         pair, decision = found.pair, found.decision
         if decision.judgement.status != "ok" and (units := self._units(clouds, clock)) is not None:
             decision = decision.with_note(units, first=True)
@@ -248,20 +268,15 @@ class Registrar:
         said = None if opinion is None else opinion.output
         weighed = said or FilterOutput(np.zeros(len(pair.matched)))
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
-        matched, hypotheses = pair.matched, decision.hypotheses
-        if exchanged:
-            result = result.inverse()
-            matched = Correspondences(np.hstack([matched.target, matched.source]))
-            hypotheses = tuple(Hypothesis(inverse(h.T_target_source)) for h in hypotheses)
-        return Explanation(result, *clouds, matched, weighed, inliers, hypotheses).remembering(*given)
+        return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
     def _look(
         self,
         prepared: Clouds,
         places: Places,
         clock: StageClock,
-        initial: ArrayLike | None,
-        given: ArrayLike | None,
+        initial: FloatArray | None,
+        given: FloatArray | None,
         sides: Sides = "sensor",
         rivals: Decision | None = None,
     ) -> tuple[Pair, FilterOutput, Decision]:
@@ -321,7 +336,11 @@ class Registrar:
         clock("units")
         sensor = None if source.sensor is None else source.sensor / ratio
         smaller = replace(source, points=source.points / ratio, origin=source.origin / ratio, sensor=sensor)
-        if not self.register(smaller, target).ok:
+        try:
+            fits = self.register(smaller, target).ok
+        except EmptyCloudError:  # next to nothing is left of it on the grid that was asked for
+            return None
+        if not fits:
             return None
         return (
             f"units differ: with all lengths of '{source.name}' divided by {ratio:.6g} the clouds fit"

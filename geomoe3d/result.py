@@ -113,7 +113,9 @@ class RegistrationResult:
         confidence: in [0, 1]; see docs/concepts.md for what it is made of.
         overlap: share of source voxel points (1,500 of them at most) with a target point within the inlier
             threshold.
-        evidence: what the clouds say of the answer, see `geomoe3d.scoring.surfaces.Evidence`, and
+        evidence: what the clouds say of the answer, see `geomoe3d.scoring.surfaces.Evidence` (measured from the
+            cloud with more points, whichever the source is; the overlap from the source);
+            ``overlap_target``, the share of target voxel points with a source point within the threshold;
             ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; ``scale_ratio``
             and ``scale_sigma``, see `geomoe3d.decision.scale.Scale`, where enough surface is shared; empty
             where nothing was estimated.
@@ -380,9 +382,9 @@ class RegistrationResult:
         """The same answer with the roles of source and target exchanged.
 
         The information matrix is carried over to the new target (the old source): the perturbation is
-        expressed in its axes about the same physical point, and the accuracy's overlaps change places.
-        `overlap`, evidence and the alternative's translation difference keep the meaning measured on the
-        original source.
+        expressed in its axes about the same physical point. The overlaps change places, a ratio of scales is
+        turned over; the rest of the evidence and the alternative's translation difference keep the meaning measured
+        on the original source.
         """
         from geomoe3d.geometry.se3 import inverse, transform_points
 
@@ -395,9 +397,17 @@ class RegistrationResult:
         other = self.alternative
         if other is not None:
             other = replace(other, T_target_source=inverse(other.T_target_source))
+        evidence, overlap = dict(self.evidence), self.overlap
+        if "overlap_target" in evidence:
+            overlap = evidence["overlap_target"]
+            evidence |= {"overlap": overlap, "overlap_target": self.overlap}
+        if "scale_ratio" in evidence:
+            evidence["scale_ratio"] = 1 / evidence["scale_ratio"]
         answer = replace(
             self,
             T_target_source=T,
+            overlap=overlap,
+            evidence=evidence,
             alternative=other,
             information_matrix=A.T @ self.information_matrix @ A,
             information_center=transform_points(T, self.information_center[None])[0],

@@ -143,6 +143,17 @@ class Correspondences:
             normals_signed=source.viewpoint is not None and target.viewpoint is not None,
         )
 
+    def exchanged(self) -> Correspondences:
+        """The same from the target to the source."""
+        return replace(
+            self,
+            points=np.roll(self.points, 3, axis=1),
+            source_index=self.target_index,
+            target_index=self.source_index,
+            viewpoints=None if self.viewpoints is None else (self.viewpoints[1], self.viewpoints[0]),
+            normals=None if self.normals is None else (self.normals[1], self.normals[0]),
+        )
+
     def take(self, rows: IntArray | BoolArray) -> Correspondences:
         """The correspondences of the given rows (index or mask), all per-row attributes kept."""
 
@@ -222,6 +233,14 @@ class Hypothesis:
         for said in self.scores.values():
             product *= said.factor
         return product
+
+    def exchanged(self) -> Hypothesis:
+        """The same from the target to the source; what was said of it stays."""
+        R, t = self.T_target_source[:3, :3], self.T_target_source[:3, 3]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R.T, -R.T @ t
+        refined = None if self.refined is None else self.refined.exchanged()
+        return replace(self, T_target_source=T, refined=refined)
 
 
 @dataclass(frozen=True)

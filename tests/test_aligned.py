@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.config import build_config
 from geomoe3d.errors import ConfigError, InputError
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.networks.aligned import CHANNELS, PRIOR_KERNEL
 from geomoe3d.networks.architecture import CHANNEL_WIDTHS, NetworkConfig
@@ -89,7 +90,7 @@ def test_the_share_that_preserves_length_counts_others_alone(count: int) -> None
     rows, T = scene(count=count)
     found = column(aligned(rows, T[None])[0], "degree")
     unit = (rows - rows.mean(0)) / VOXEL
-    anchors = np.arange(0, count, -(-count // 1000))  # beyond a thousand every second or third stands for all
+    anchors = drawn_rows(rows / (2 * VOXEL), 1.0, 1000)  # beyond a thousand some stand for all
     gap = np.abs(
         np.linalg.norm(unit[:, None, :3] - unit[None, anchors, :3], axis=2)
         - np.linalg.norm(unit[:, None, 3:] - unit[None, anchors, 3:], axis=2)

@@ -169,13 +169,14 @@ def test_seeds_are_the_best_supported_and_spread() -> None:
     points = rng.normal(size=(50, 3)).astype(np.float32) * 100
     points[:10] = points[0] + 0.01 * rng.normal(size=(10, 3))  # one bundle with the largest supports
     support = np.r_[np.linspace(50, 41, 10), np.linspace(40, 26, 40)].astype(np.float32)
-    seeds = consensus.choose_seeds(support, cdist(points, points).astype(np.float32), 30)
+    ranks = rng.permutation(50).astype(np.uint64)
+    seeds = consensus.choose_seeds(support, cdist(points, points).astype(np.float32), ranks, 30)
     # 0 leads; all others of the bundle count half, less than any of the scattered ones. Three quarters of
-    # the seeds are the strongest in that order, the others lie evenly over the rest of it.
+    # the seeds are the strongest in that order, the others those of the rest that have the lowest ranks.
     order = [0, *range(10, 50), *range(1, 10)]
     assert list(seeds[:23]) == order[:23]
-    assert list(seeds[23:]) == [order[23 + k] for k in (0, 4, 8, 13, 17, 21, 26)]
-    assert list(consensus.choose_seeds(support, cdist(points, points), 50)) == list(range(50))
+    assert list(seeds[23:]) == sorted(order[23:], key=lambda k: ranks[k])[:7]
+    assert list(consensus.choose_seeds(support, cdist(points, points), ranks, 50)) == list(range(50))
 
 
 def test_score_is_the_documented_sum() -> None:

@@ -126,17 +126,17 @@ def test_each_network_has_its_own_filter() -> None:
 def test_mutual_rows_come_first() -> None:
     rows, _ = scene(4)
     mutual = np.arange(len(rows)) % 3 == 0
-    few = likeliest_rows(Correspondences(rows, mutual=mutual), 120, 0)
+    few = likeliest_rows(Correspondences(rows, mutual=mutual), 120, VOXEL, 0)
     assert few.mutual is not None
     assert len(few) == 120
     assert few.mutual.sum() == mutual.sum()
-    assert likeliest_rows(few, 120, 0) is few
+    assert likeliest_rows(few, 120, VOXEL, 0) is few
 
 
 def test_more_rows_than_are_scored_are_all_weighed_wherever_they_stand() -> None:
     rows, _ = scene(4, count=1500)
     rows = rows[np.argsort(rows[:, 0])]
-    few = likeliest_rows(Correspondences(rows), 1000, 0)
+    few = likeliest_rows(Correspondences(rows), 1000, VOXEL, 0)
     assert few.source[:, 0].max() > 0.9 * rows[:, 0].max()  # spread, not the first thousand
     found = weigh(Correspondences(rows))
     assert found.hypotheses

@@ -28,7 +28,7 @@ def surfaces():
         made[k] = Surface(cloud.points, cloud.normals, signed=False)
     elsewhere = prepare(PointCloud(scene(5) + 50), 0.12, CONFIG.preparation, viewpoint=None, seed=0)
     made[6], truth[6] = Surface(elsewhere.points, elsewhere.normals, signed=False), np.eye(4)
-    return made, truth, Overlaps({k: s.points for k, s in made.items()})
+    return made, truth, Overlaps({k: s.points for k, s in made.items()}, 0.12)
 
 
 def moved_about(truth, rng, turn=0.02, shift=0.1):

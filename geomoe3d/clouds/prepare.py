@@ -13,6 +13,7 @@ from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.columns import extents, largest_of_rows
+from geomoe3d.geometry.draws import OFF_ROUND, mixed
 from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.threads import each, usable_threads
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
@@ -20,7 +21,8 @@ from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 _AUTO_SAMPLE = 100_000  # points looked at when a voxel size is chosen: density is known well enough by then
 _MIN_POINTS = 3
 _MAX_EXTENT_RATIO = 50
-_CLOSE_COUNT = 0.01  # half a percent of the voxel size, which is rounded to two digits
+_RAMP, _AT_WALL, _LEAST_HELD, _FULL = 0.05, 1e-3, 0.01, 0.1
+_E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
 _SPACING_POINTS = 20_000
 _BITS = 21  # of a 64-bit voxel key, for each axis
 
@@ -63,7 +65,7 @@ def prepare(
         )
     normals = estimate_normals(voxels, radius, config.normal_neighbors)
     if viewpoint is None and config.viewpoint != "centroid":
-        viewpoint = guess_viewpoint(voxels, normals, 4 * voxel_size, seed=seed)
+        viewpoint = guess_viewpoint(voxels, normals, voxel_size, seed=seed)
     towards = voxels.mean(0) if viewpoint is None else viewpoint
     return PreparedCloud(
         points=voxels,
@@ -81,15 +83,24 @@ def prepare(
 
 
 def choose_voxel_size(source: PointCloud, target: PointCloud, num_points: int) -> float:
-    """A voxel size for two clouds from their extent and density, rounded to two digits, cloud units.
+    """A voxel size for two clouds from their extent and density, cloud units.
 
-    It is the size at which the larger cloud occupies about ``num_points`` voxels, but at least twice the
-    typical spacing of the sparser cloud, below which a grid no longer evens out density.
+    It is the size at which the larger cloud occupies about ``num_points`` voxels, but about twice the typical spacing
+    of the sparser cloud at least, below which a grid no longer evens out density; see `round_size`.
 
     Both clouds must have passed `check_cloud`.
     """
 
-    return float(f"{max(own_voxel_sizes(source, target, num_points)):.2g}")
+    return round_size(max(own_voxel_sizes(source, target, num_points)))
+
+
+def round_size(size: float) -> float:
+    """The nearest number of the series E24 (1, 1.1, 1.2, 1.3, 1.5, ... times a power of ten): steps so wide that
+    clouds that differ by rounding get one voxel size."""
+    power = 10.0 ** np.floor(np.log10(size))
+    series = np.array([*_E24, 100]) / 10
+    nearest = series[np.abs(np.log(series * (power / size))).argmin()]
+    return float(f"{nearest * power:.2g}")
 
 
 def own_voxel_sizes(source: PointCloud, target: PointCloud, num_points: int) -> tuple[float, float]:
@@ -134,7 +145,7 @@ def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float
         InputError: a voxel so small that the grid's indices overflow.
     """
     for cloud in (source, target):
-        while (occupied := len(np.unique(voxel_keys(cloud.points, voxel_size)))) > max_points:
+        while (occupied := len(np.unique(voxel_keys(cloud.points, voxel_size, OFF_ROUND)))) > max_points:
             # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
             voxel_size *= 1.02 * float(np.sqrt(occupied / max_points))
     return voxel_size
@@ -159,25 +170,35 @@ def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
 def _size_for_count(points: FloatArray, num_points: int) -> float:
     """The voxel size at which the points occupy ``num_points`` voxels, from a seeded-by-order sample.
 
-    Surfaces fill voxels like 1 / size^2, which gives the next guess; three are enough for two digits.
+    Counted on grids whose edges are powers of sqrt(2), whatever the cloud, and read off between two of them: a
+    search that stops when it is close enough would end elsewhere when one point moves to another voxel. For the same
+    reason a voxel that holds next to nothing counts in part.
     """
     sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
     extent = robust_extent(points)
     # A small cloud cannot fill the voxels asked for; half its points is what a grid can still even out.
     goal = min(num_points, max(len(sample) // 2, 1))
-    size = extent / float(np.sqrt(goal))
-    for _ in range(4):
-        occupied = len(np.unique(voxel_keys(sample, size)))
-        if abs(occupied - goal) < _CLOSE_COUNT * goal:
-            break
-        size = min(size * float(np.sqrt(occupied / goal)), extent)
-    return size
+
+    def count(step: int) -> float:
+        weights, _, starts = _by_voxel(sample, 2.0 ** (step / 2))
+        return float(np.minimum(np.add.reduceat(weights, starts) / _FULL, 1).sum())
+
+    coarsest = int(np.ceil(2 * np.log2(extent)))
+    step = min(round(2 * np.log2(extent / np.sqrt(goal))), coarsest)
+    fine, coarse = count(step), count(step + 1)
+    while coarse > goal and step < coarsest:
+        step, fine, coarse = step + 1, coarse, count(step + 2)
+    while fine < goal:
+        step, fine, coarse = step - 1, count(step - 1), fine
+    share = np.log(fine / goal) / np.log(fine / coarse) if fine > coarse else 1.0
+    return float(min(2.0 ** ((step + share) / 2), extent))
 
 
 def typical_spacing(points: FloatArray) -> float:
-    """Median distance from a point to its nearest other, cloud units; 0 where most points coincide.
+    """Distance from a point to its nearest other, mean of the middle half, cloud units; 0 where most points coincide.
 
-    Estimated on about 2,000 points inside the central part of the cloud that holds about 20,000.
+    Estimated on about 2,000 points inside the central part of the cloud that holds about 20,000. (A median would
+    jump where the distances form clusters, as those of points on a grid do.)
     """
     from scipy.spatial import cKDTree
 
@@ -185,10 +206,15 @@ def typical_spacing(points: FloatArray) -> float:
     away = largest_of_rows(np.abs(points - np.median(points[:: max(1, len(points) // 20_000)], axis=0)))
     if len(points) > _SPACING_POINTS:
         away_limit = np.partition(away, _SPACING_POINTS)[_SPACING_POINTS]
-        points = points[away <= away_limit]
-    queries = points[:: max(1, len(points) // 2000)]
+        central = np.flatnonzero(away <= away_limit)
+        asked = mixed(central.astype(np.uint64)) % np.uint64(_SPACING_POINTS // 2000) == 0
+        points, queries = points[central], points[central[asked]]
+    else:
+        queries = points[:: max(1, len(points) // 2000)]
     distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(queries, k=2)
-    return float(np.median(np.asarray(distances)[:, 1]))
+    nearest = np.sort(np.asarray(distances)[:, 1])
+    quarter = len(nearest) // 4
+    return float(nearest[quarter : len(nearest) - quarter].mean())
 
 
 def drop_duplicates(points: FloatArray) -> tuple[FloatArray, int]:
@@ -208,8 +234,8 @@ def drop_duplicates(points: FloatArray) -> tuple[FloatArray, int]:
     return points[np.sort(first)], len(points) - len(first)
 
 
-def voxel_keys(points: FloatArray, voxel_size: float) -> IntArray:
-    """One integer per point that names its voxel on a grid through the local origin.
+def voxel_keys(points: FloatArray, voxel_size: float, shift: float = 0.0) -> IntArray:
+    """One integer per point that names its voxel on a grid with a corner ``shift`` voxels from the local origin.
 
     Raises:
         InputError: the cloud spans more than 2^21 voxels along an axis.
@@ -217,7 +243,7 @@ def voxel_keys(points: FloatArray, voxel_size: float) -> IntArray:
     limit = 2**_BITS
     keys: IntArray = np.zeros(len(points), dtype=np.int64)
     for column in points.T:
-        cells = np.floor(column / voxel_size)
+        cells = np.floor(column / voxel_size - shift)
         cells -= cells.min()
         if cells.max() >= limit:
             extent = float(extents(points).max())
@@ -231,13 +257,39 @@ def voxel_keys(points: FloatArray, voxel_size: float) -> IntArray:
 
 
 def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
-    """Mean point of every occupied voxel, (n, 3), ordered by voxel."""
-    order = np.argsort(keys := voxel_keys(points, voxel_size), kind="stable")
+    """Mean point of every occupied voxel, (n, 3), ordered by voxel.
+
+    In the last twentieth of a voxel before a wall the weight of a point falls from 1 to next to nothing. So one that
+    rounding or noise puts on the other side changes next to nothing. For the same reason a voxel that holds less
+    than a hundredth of a point is left out where a fuller one's mean lies within its edge, and the grid has
+    its corner at no round number: floors lie at zero, and points of a fused volume on its own grid.
+    """
+    from scipy.spatial import cKDTree
+
+    weights, order, starts = _by_voxel(points, voxel_size)
+    sums = np.add.reduceat(weights, starts)
+    means: FloatArray = np.add.reduceat(points[order] * weights[:, None], starts, axis=0) / sums[:, None]
+    kept = sums >= _LEAST_HELD
+    thin = np.flatnonzero(~kept)
+    if not kept.any():
+        return means
+    if len(thin):
+        tree = cKDTree(means[kept], balanced_tree=False, compact_nodes=False)
+        kept[thin] = np.isinf(tree.query(means[thin], distance_upper_bound=voxel_size)[0])
+    return means[kept]
+
+
+def _by_voxel(points: FloatArray, voxel_size: float) -> tuple[FloatArray, IntArray, IntArray]:
+    """Weights in a voxel, see `voxel_means`, and rows of the points, both by voxel, and where each voxel starts."""
+    order = np.argsort(keys := voxel_keys(points, voxel_size, OFF_ROUND), kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    counts = np.diff(np.append(starts, len(keys)))
-    means: FloatArray = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
-    return means
+    inside: FloatArray = np.full(len(points), 0.5)
+    for column in points.T:
+        place = column / voxel_size - OFF_ROUND
+        place -= np.floor(place) + 0.5
+        np.minimum(inside, 0.5 - np.abs(place, out=place), out=inside)
+    return np.clip(inside[order] / _RAMP, _AT_WALL, 1), order, starts
 
 
 def drop_isolated(points: FloatArray, radius: float) -> FloatArray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.geometry.columns import bounds
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import BoolArray, FloatArray, PointCloud, PreparedCloud
 
 # How near the origin, in extents, the mean, the middle of the box and the lowest corner come only where a
@@ -22,6 +23,7 @@ _PIXEL_DEG = 3.0
 _NUM_CANDIDATES = 200
 _NUM_KEPT = 4
 _NUM_POINTS = 1500
+_MARGIN_VOXELS = 4.0
 _LEAST_VISIBLE = 0.85  # below it the cloud was seen from several sides
 _GRAZING_COSINE = 0.2  # surfaces seen flatter than this return few points to a real sensor
 
@@ -106,7 +108,7 @@ def sign_breaks(cloud: PreparedCloud) -> float:
 
 
 def guess_viewpoint(
-    points: FloatArray, normals: FloatArray, margin: float, *, seed: int = 0
+    points: FloatArray, normals: FloatArray, voxel_size: float, *, seed: int = 0
 ) -> FloatArray | None:
     """The place from which nearly all of a cloud can have been seen, (3,) in its frame, or None.
 
@@ -118,11 +120,11 @@ def guess_viewpoint(
     Args:
         points: (N, 3), at least one.
         normals: (N, 3) unit, of any sign.
-        margin: points this much farther than another in the same direction count as hidden.
+        voxel_size: edge of the grid; points four of it farther than another in the same direction count as hidden.
         seed: decides places and points looked at.
     """
-    rng = np.random.default_rng(seed)
-    chosen = rng.permutation(len(points))[:_NUM_POINTS]
+    margin, rng = _MARGIN_VOXELS * voxel_size, np.random.default_rng(seed)
+    chosen = drawn_rows(points, voxel_size, _NUM_POINTS, seed)
     points, normals = points[chosen], normals[chosen]
     low, high = bounds(points)
     half = (high - low) / 2

@@ -12,7 +12,7 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.confidence import Information, Judgement
 from geomoe3d.decision.scale import Scale
-from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames
+from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames, transform_points
 from geomoe3d.result import Accuracy, Alternative, CloudReport, RegistrationResult, Status
 from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
@@ -72,17 +72,19 @@ class Decision:
         told = (note, *reasons) if first else (*reasons, note)
         return replace(self, judgement=replace(self.judgement, reasons=told))
 
-    def with_scale(self, scale: Scale | None) -> Decision:
+    def with_scale(self, scale: Scale | None, *, exchanged: bool = False) -> Decision:
         """The same decision with the scale measured: never ok where it differs, and then that is said first.
 
-        Of an answer that is hardly believed nothing is said: its surfaces are not those of one body.
+        Of an answer that is hardly believed nothing is said: its surfaces are not those of one body. ``exchanged``: the
+        sentence calls the second cloud the source.
         """
         was = self.judgement
         if scale is None or not scale.differs or was.confidence < _BELIEVED:
             return replace(self, scale=scale)
         status: Status = "low_confidence" if was.status == "ok" else was.status
         confidence = min(was.confidence, _WRONG_SCALE_CONFIDENCE)
-        judgement = Judgement(status, (scale.sentence(), *was.reasons), confidence)
+        said = (scale.exchanged() if exchanged else scale).sentence()
+        judgement = Judgement(status, (said, *was.reasons), confidence)
         return replace(self, scale=scale, judgement=judgement)
 
     def residuals(self, matched: Correspondences) -> FloatArray:
@@ -105,7 +107,7 @@ def finished_result(
         reasons=decision.judgement.reasons,
         confidence=decision.judgement.confidence,
         overlap=decision.evidence.overlap if decision.evidence else 0.0,
-        evidence=_evidence(decision),
+        evidence=_evidence(decision, pair),
         num_correspondences=len(matched),
         num_inliers=int((decision.residuals(matched) < threshold).sum()),
         inlier_threshold=threshold,
@@ -182,13 +184,14 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
     return tuple(versions.items())
 
 
-def _evidence(decision: Decision) -> dict[str, float]:
+def _evidence(decision: Decision, pair: Pair) -> dict[str, float]:
     """Numbers of the answer by name; without a network there is no verdict."""
     evidence, opinion, scale = decision.evidence, opinion_of(decision.answer), decision.scale
     if evidence is None or decision.answer is None:
         return {}
     return {
         **asdict(evidence),
+        "overlap_target": _overlap_target(decision.answer.T_target_source, pair),
         **({} if opinion is None else {"verdict": opinion.verdict}),
         "surface_score": evidence.surface_score,
         "score": decision.answer.score,
@@ -196,6 +199,16 @@ def _evidence(decision: Decision) -> dict[str, float]:
         "looseness": decision.information.looseness,
         **({} if scale is None else {"scale_ratio": scale.ratio, "scale_sigma": scale.sigma}),
     }
+
+
+def _overlap_target(T_target_source: FloatArray, pair: Pair) -> float:
+    """Share of the target's points with a source point within the threshold."""
+    from scipy.spatial import cKDTree
+
+    source, target = pair.clouds
+    tree = cKDTree(transform_points(T_target_source, source.points), balanced_tree=False, compact_nodes=False)
+    distance, _ = tree.query(target.points, distance_upper_bound=pair.inlier_threshold)
+    return float(np.isfinite(distance).mean())
 
 
 def _alternative(decision: Decision, source: PreparedCloud, target: PreparedCloud) -> Alternative | None:

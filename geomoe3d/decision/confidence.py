@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.config import DecisionConfig
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import cross_matrix, transform_points
 from geomoe3d.result import Status
 from geomoe3d.scoring.network import opinion_of
@@ -33,7 +34,7 @@ _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002
 _LEAST_LOOSENESS, _MOST_LOOSENESS = 0.02, 10.0
 _LOOSEST = 1000.0
 _ASKED = 200  # points of a scan of unknown sensor whose deviation is asked for
-_MOST_LEAD = 30.0
+MOST_LEAD = 30.0
 _MOST_VIOLATION = 0.1
 UNRIVALLED_LEAD = 3.0
 _LIKELY = 0.5
@@ -117,7 +118,7 @@ def measure_information(
     scaled = J / np.array([radius] * 3 + [1.0] * 3)
     smallest = float(np.linalg.eigvalsh(scaled.T @ scaled / len(points))[0])
     matrix = J.T @ J / variance
-    places = source.points[:: -(-len(source) // _ASKED)]
+    places = source.points[drawn_rows(source.points, source.voxel_size, _ASKED)]
     if source.viewpoint is not None:
         places = source.viewpoint[None]
     deviations = deviations_at(matrix, center, transform_points(T_target_source, places)) / source.voxel_size
@@ -300,7 +301,7 @@ def confidence_inputs(
         np.log(
             [
                 max(evidence.surface_score, _LEAST_SCORE),
-                min(max(lead, 0.5), _MOST_LEAD),
+                min(max(lead, 0.5), MOST_LEAD),
                 evidence.overlap + _LEAST_OVERLAP,
                 information.observability + _ADDED_OBSERVABILITY,
                 min(max(information.looseness, _LEAST_LOOSENESS), _MOST_LOOSENESS),

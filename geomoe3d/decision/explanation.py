@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geomoe3d.clouds.inputs import Inputs, mark_of
+from geomoe3d.geometry.se3 import motions_apart
 from geomoe3d.result import RegistrationResult
 from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud
 
@@ -41,6 +42,24 @@ class Explanation:
     def weights(self) -> FloatArray:
         """(K,) the filter's weights."""
         return self.weighed.weights
+
+    def exchanged(self) -> Explanation:
+        """The same with the roles of source and target exchanged."""
+        result, source = self.result.inverse(), self.target
+        other = result.alternative
+        if other is not None:
+            shift, _ = motions_apart(
+                result.T_target_source, other.T_target_source, source.file_points.mean(axis=0)
+            )
+            result = replace(result, alternative=replace(other, translation_difference=shift))
+        return replace(
+            self,
+            result=result,
+            source=source,
+            target=self.source,
+            correspondences=self.correspondences.exchanged(),
+            hypotheses=tuple(h.exchanged() for h in self.hypotheses),
+        )
 
     def view(self, unit: str = "") -> RegistrationView:
         """What the displays take: clouds, answer and correspondences in file coordinates, and their unit's name."""

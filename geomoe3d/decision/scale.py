@@ -8,7 +8,7 @@ surfaces: how differently they stretch along different directions, which no scal
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,10 @@ class Scale:
         off = abs(float(np.log(self.ratio)))
         enough = _SIGNIFICANT / 2 if off > _UNHEARD_OF and self.sigma < _FIRM else _SIGNIFICANT
         return off > max(enough * self.sigma, _TOLERATED)
+
+    def exchanged(self) -> Scale:
+        """The same of the target beside the source."""
+        return replace(self, ratio=1 / self.ratio)
 
     def sentence(self) -> str:
         """What a user is told where it `differs`."""

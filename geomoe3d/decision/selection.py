@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.answer import Decision
-from geomoe3d.decision.confidence import Judgement, judge, lead_over, measure_information
+from geomoe3d.decision.confidence import MOST_LEAD, Judgement, judge, lead_over, measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
 from geomoe3d.refinement.base import Refiner
 from geomoe3d.runtime.timing import StageClock
@@ -24,7 +24,7 @@ from geomoe3d.scoring.base import PairScorer, Scorer
 from geomoe3d.scoring.surfaces import SURFACES, SurfaceScorer, evidence_of
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
-_CLOSE_LEAD = 2.0
+_MOST_RIVALS = 3  # refined where they come close, before the best is taken for the rival
 _KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
 _MOST_ROUNDS = 6  # further hypotheses shown one by one, where a scorer rejects those that the clouds like
 _DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two transforms are different
@@ -200,19 +200,22 @@ class Selection:
 
     def _rival(self, answer: Hypothesis) -> tuple[Hypothesis | None, float]:
         """The best clearly different hypothesis, and the answer's lead over it."""
-        other = self._different_from(answer, self.hypotheses)
-        if other is None:
-            return None, lead_over(answer.score, None)
-        # A fair race: a rival that the clouds like about as well is refined too, and scored again.
-        by_clouds = (evidence_of(h).surface_score for h in (answer, other))
-        if lead_over(*by_clouds) < _CLOSE_LEAD:
-            refined = self._refine(other)
-            if refined.score > other.score:
-                other = self._different_from(answer, [refined]) or other
-        return other, lead_over(answer.score, other.score)
+        best: Hypothesis | None = None
+        different = (h for h in self.hypotheses if self._differ(answer, h))
+        for other in distinct(different, self._source, self._shift, _MOST_RIVALS):
+            # A fair race: a rival that could matter is refined too. One that refines to the answer itself was only
+            # proposed less well, and is none: how far off it was proposed is an accident.
+            close = lead_over(answer.score, other.score) < MOST_LEAD
+            refined = self._refine(other) if close else other
+            if not self._differ(answer, refined):
+                continue
+            other = max(other, refined, key=lambda h: h.score)
+            if best is None or other.score > best.score:
+                best = other
+        return best, lead_over(answer.score, None if best is None else best.score)
 
-    def _different_from(self, answer: Hypothesis, ranked: Iterable[Hypothesis]) -> Hypothesis | None:
-        return clearly_different(ranked, answer.T_target_source, self._source, self._shift)
+    def _differ(self, one: Hypothesis, other: Hypothesis) -> bool:
+        return are_different(one.T_target_source, other.T_target_source, self._source, self._shift)
 
     def _overruled(self, answer: Hypothesis) -> str | None:
         """A sentence where the answer is clearly another transform than the user's first guess, refined."""

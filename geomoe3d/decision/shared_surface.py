@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
 _LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
@@ -44,7 +45,7 @@ class SharedSurface:
 
         self._clouds = source, target
         self._trees = tuple(cKDTree(cloud.points) for cloud in self._clouds)
-        self._asked = tuple(np.arange(0, len(c), -(-len(c) // _MOST_ASKED)) for c in self._clouds)
+        self._asked = tuple(drawn_rows(c.points, c.voxel_size, _MOST_ASKED) for c in self._clouds)
 
     def contact(self, T_target_source: FloatArray, reach: float, scale: float = 1.0) -> Contact:
         """Points within ``reach``, cloud units, whose normals agree up to sign, under a similarity.

@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.estimators.surroundings import Surroundings
+from geomoe3d.geometry.draws import Ranks, cell_ranks
 from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread_shared, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.runtime.threads import each, single_blas_thread
@@ -108,13 +109,15 @@ class ConsensusEstimator(Estimator):
         # Multiples of 1/1024 add up exactly in float32, in whatever order. Weighed by planes they do not:
         # fixed blocks and one BLAS thread keep the answers the same for any number of threads.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
-        R, t, scores = self._propose(source, target, vote, self._dense_rows(given, seed), surroundings)
+        ranks = cell_ranks(rows, inlier_threshold, seed)
+        dense = self._dense_rows(given, ranks)
+        R, t, scores = self._propose(source, target, vote, ranks, dense, surroundings)
         # Refits bring some together, and some are not firm: half as many again are carried to the end.
         some = self.num_hypotheses + self.num_hypotheses // 2
         for limit in (max(self.num_refined, some), some):
             keep = self._distinct_rows(R, t, scores, limit)
             R, t = R[keep], t[keep]
-            for _ in range(self.num_refits):
+            for _ in range(self.num_refits if limit > some else 10):
                 R, t = refit(R, t, source, target, vote)
             scores = score(R, t, source, target, vote, surroundings)
             if surroundings is not None:
@@ -124,19 +127,18 @@ class ConsensusEstimator(Estimator):
         finished = _finished(R[best], t[best], scores[best], rows, centre, vote, inlier_threshold)
         return finished[: self.num_hypotheses]
 
-    def _dense_rows(self, given: FloatArray, seed: int) -> IntArray:
+    def _dense_rows(self, given: FloatArray, ranks: Ranks) -> IntArray:
         """Rows that take part in proposing, at most ``max_dense``: the heaviest, ties by seeded choice."""
         if len(given) <= self.max_dense:
             return np.arange(len(given))
-        shuffled = np.random.default_rng(seed).permutation(len(given))
-        heaviest = np.argsort(-given[shuffled], kind="stable")[: self.max_dense]
-        return np.sort(shuffled[heaviest])
+        return np.sort(np.lexsort((ranks, -given))[: self.max_dense])
 
     def _propose(
         self,
         source: Float32Array,
         target: Float32Array,
         vote: Float32Array,
+        ranks: Ranks,
         rows: IntArray,
         surroundings: Surroundings | None,
     ) -> tuple[Floats, Floats, Float32Array]:
@@ -145,8 +147,8 @@ class ConsensusEstimator(Estimator):
         near = None if surroundings is None else surroundings.take(rows)
         source_distance, compatible = compatibility(p, q, self.length_tolerance, near)
         support = compatible @ v
-        seeds = choose_seeds(support, source_distance, self.num_seeds)
-        witnesses = np.sort(choose_seeds(support, source_distance, self.num_witnesses))
+        seeds = choose_seeds(support, source_distance, ranks[rows], self.num_seeds)
+        witnesses = np.sort(choose_seeds(support, source_distance, ranks[rows], self.num_witnesses))
 
         def of(some: IntArray) -> tuple[Floats, Floats, Float32Array]:
             members, weights = local_sets(compatible, some, v, max(self.set_sizes), witnesses)
@@ -266,11 +268,11 @@ def _blocks(rows: IntArray) -> list[IntArray]:
     return [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
 
 
-def choose_seeds(support: Float32Array, source_distance: Float32Array, limit: int) -> IntArray:
-    """Rows with the largest support, and a quarter of the limit spread evenly over all others.
+def choose_seeds(support: Float32Array, source_distance: Float32Array, ranks: Ranks, limit: int) -> IntArray:
+    """Rows with the largest support, and a quarter of the limit drawn from all others, those of the lowest ranks.
 
     One beaten by a neighbour within the threshold counts half, so that a dense bundle of wrong matches does
-    not take all places; the spread quarter gives a second, weaker motion its proposals.
+    not take all places; the drawn quarter gives a second, weaker motion its proposals.
     """
     if len(support) <= limit:
         return np.arange(len(support))
@@ -279,8 +281,8 @@ def choose_seeds(support: Float32Array, source_distance: Float32Array, limit: in
     order = np.argsort(-strength, kind="stable")
     strongest = limit - limit // 4
     rest = order[strongest:]
-    spread_rows = rest[np.linspace(0, len(rest) - 1, limit // 4).astype(np.int64)]
-    return np.concatenate([order[:strongest], spread_rows])
+    drawn = rest[np.argsort(ranks[rest], kind="stable")[: limit // 4]]
+    return np.concatenate([order[:strongest], drawn])
 
 
 def local_sets(

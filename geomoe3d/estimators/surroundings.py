@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.keypoints import PIXEL_DEG, KeypointSurfaces
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, FloatArray, IntArray
 
@@ -168,8 +169,8 @@ class Surroundings:
         if self.views is None:
             return np.ones(len(R))
         source_view, target_view = self.views
-        step = max(1, -(-len(self.points[0]) // _ASKED))
-        p, q = (points[::step] for points in self.points)
+        rows = drawn_rows(np.hstack(self.points), 1.0, _ASKED)
+        p, q = (points[rows] for points in self.points)
         # R p + t of all motions as one product: einsum takes six times as long.
         moved = _turned(p, R) + t
         back = _turned(q, R.transpose(0, 2, 1)) - np.einsum("kji,kj->ki", R, t)

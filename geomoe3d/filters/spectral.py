@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.filters.base import OutlierFilter, outlier_filter
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import Correspondences, FilterOutput, Float32Array
 
 
@@ -35,9 +36,7 @@ class SpectralFilter(OutlierFilter):
         count = len(correspondences)
         if count == 0:
             return FilterOutput(np.zeros(0))
-        anchors = np.arange(count)
-        if count > self.max_anchors:
-            anchors = np.sort(np.random.default_rng(seed).choice(count, self.max_anchors, replace=False))
+        anchors = drawn_rows(correspondences.points, voxel_size, self.max_anchors, seed)
         rows = correspondences.points - correspondences.points.mean(0)
         unit = (rows / (self.distance_voxels * voxel_size)).astype(np.float32)
         C = _soft_compatibility(unit[anchors], unit[anchors])

@@ -17,7 +17,7 @@ from geomoe3d.types import FloatArray
 
 LEAST_MATCHED = 10
 """Matching points below which an alignment is not believed."""
-_MAX_TURN_DEG = 15.0  # a local method that turns further has left the motion it was to polish
+_MAX_TURN_DEG = 45.0  # a local method that turns further has left the motion it was to polish
 _MAX_SHIFT = 6.0  # voxels
 # A step that moves less (and turns less than 0.1 deg, the library's own) ends it; ten times less takes twice
 # the steps for nothing.

@@ -14,6 +14,7 @@ import numpy as np
 
 from geomoe3d.config import MatchingConfig
 from geomoe3d.errors import InputError
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.matching.base import Matcher, matcher
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
@@ -101,11 +102,8 @@ def match(
         ratio=None if ratio is None else ratio.ravel(),
         mutual=mutual,
     ).take(keep)
-    if len(found) <= config.max_correspondences:
-        return found
-    shuffled = np.random.default_rng(seed).permutation(len(found))
-    mutual_first = np.argsort(~mutual[keep][shuffled], kind="stable")
-    return found.take(np.sort(shuffled[mutual_first[: config.max_correspondences]]))
+    limit = config.max_correspondences
+    return found.take(drawn_rows(found.source, source.voxel_size, limit, seed, first=found.mutual))
 
 
 @single_blas_thread()

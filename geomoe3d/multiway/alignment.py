@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import cross_matrix, inverse, make_transform, project_to_so3, transform_points
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.runtime.threads import single_blas_thread
@@ -76,8 +77,7 @@ def align_scans(
     from scipy.spatial import cKDTree
 
     scans = sorted(poses)
-    rng = np.random.default_rng(seed)
-    chosen = {k: np.sort(rng.permutation(len(surfaces[k].points))[:_NUM_POINTS]) for k in scans}
+    chosen = {k: drawn_rows(surfaces[k].points, voxel_size, _NUM_POINTS, seed) for k in scans}
     trees = {k: cKDTree(surfaces[k].points) for k in scans}
     centers = {k: surfaces[k].points.mean(0) for k in scans}
     radius = float(np.median([np.sqrt(surfaces[k].points.var(0).sum()) for k in scans]))
@@ -127,10 +127,7 @@ def align_groups(
     ]
     pairs = [(i, j) for o, i, j in sorted(shared, reverse=True)[:_MOST_PAIRS] if o >= _LEAST_OVERLAP]
     trees = {i: cKDTree(surfaces[i].points) for i in {i for i, _ in pairs}}
-    rng = np.random.default_rng(0)
-    chosen = {
-        j: rng.permutation(len(surfaces[j].points))[:_NUM_POINTS] for j in sorted({j for _, j in pairs})
-    }
+    chosen = {j: drawn_rows(surfaces[j].points, voxel_size, _NUM_POINTS) for j in {j for _, j in pairs}}
     T = T_a_b
     for reach in _GROUP_REACHES if pairs else ():
         A, slope = np.zeros((6, 6)), np.zeros(6)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import FloatArray
 
@@ -41,8 +42,7 @@ class FreeSpace:
         *,
         seed: int = 0,
     ) -> None:
-        rng = np.random.default_rng(seed)
-        self._sample = {k: p[rng.permutation(len(p))[:_SAMPLE]] for k, p in points.items()}
+        self._sample = {k: p[drawn_rows(p, voxel_size, _SAMPLE, seed)] for k, p in points.items()}
         self._views = {k: RangeImage.of(points[k], sensor) for k, sensor in sensors.items()}
         self._margin = _MARGIN * voxel_size
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray
 
@@ -18,12 +19,12 @@ class Overlaps:
 
     Args:
         points: (N, 3) voxel points by scan, local coordinates.
+        voxel_size: of the common grid, cloud units.
         seed: decides the sample.
     """
 
-    def __init__(self, points: dict[int, FloatArray], *, seed: int = 0) -> None:
-        rng = np.random.default_rng(seed)
-        self._points = {k: p[rng.permutation(len(p))[:_SAMPLE]] for k, p in points.items()}
+    def __init__(self, points: dict[int, FloatArray], voxel_size: float, *, seed: int = 0) -> None:
+        self._points = {k: p[drawn_rows(p, voxel_size, _SAMPLE, seed)] for k, p in points.items()}
         self._tree = lru_cache(maxsize=None)(self._build)
 
     def of(self, source: int, target: int, T_target_source: FloatArray) -> float:

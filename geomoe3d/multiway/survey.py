@@ -100,7 +100,7 @@ class Survey:
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
         self.surfaces: dict[int, Surface] = {}
-        self.overlaps = Overlaps({})
+        self.overlaps = Overlaps({}, self.voxel_size)
         self.free_space = FreeSpace({}, {}, self.voxel_size)
         self.similarity: FloatArray = np.zeros((0, 0))
         self.outcomes: dict[PairKey, Outcome] = {}
@@ -140,7 +140,7 @@ class Survey:
         if len(features) < 2:
             raise InputError(f"fewer than 2 scans can be used: {'; '.join(self.unusable.values())}")
         points = {number: surface.points for number, surface in self.surfaces.items()}
-        self.overlaps = Overlaps(points, seed=self.config.seed)
+        self.overlaps = Overlaps(points, self.voxel_size, seed=self.config.seed)
         sensors = {k: self.shapes[k].sensor for k, surface in self.surfaces.items() if surface.signed}
         self.free_space = FreeSpace(points, sensors, self.voxel_size, seed=self.config.seed)
         self.similarity = np.full((len(self.scans), len(self.scans)), -np.inf)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.keypoints import KeypointSurfaces, Surface
 from geomoe3d.estimators.consensus import bundle_weights, distances
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
 from geomoe3d.types import Float32Array, FloatArray, IntArray
 
@@ -130,12 +131,12 @@ class AlignedChannels:
 def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
     """Parts of (N,): 5 x the share of at most 1,000 correspondences with which each one preserves length."""
     unit = (rows - rows.mean(0)).astype(np.float32)
-    step = -(-len(unit) // _MOST_ANCHORS)
-    anchors = unit[::step]
+    chosen = drawn_rows(rows, 1.0, _MOST_ANCHORS)
+    anchors, is_anchor = unit[chosen], np.isin(np.arange(len(unit)), chosen)
 
     def part(start: int) -> Float32Array:
         some = unit[start : start + _ROWS_AT_ONCE]
-        itself = np.arange(start, start + len(some)) % step == 0  # only an anchor meets itself
+        itself = is_anchor[start : start + len(some)]  # only an anchor meets itself
         gap = distances(some[:, :3], anchors[:, :3])
         gap -= distances(some[:, 3:], anchors[:, 3:])
         compatible = np.abs(gap, out=gap) < 1.0

@@ -19,6 +19,7 @@ import numpy as np
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.errors import InputError
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
 from geomoe3d.scoring.base import Scorer, scorer
 from geomoe3d.types import FloatArray, Hypothesis, IntArray, PreparedCloud
@@ -130,9 +131,9 @@ class Verifier:
             raise InputError(
                 "clouds without features cannot be compared; call with_features(cloud, descriptor) on both first"
             )
-        rng = np.random.default_rng(seed)
-        chosen = np.sort(rng.permutation(len(source))[:num_queries])
-        random_targets = rng.permutation(len(target))[:_NUM_RANDOM]
+        edge = target.voxel_size
+        chosen = drawn_rows(source.points, edge, num_queries, seed)
+        random_targets = drawn_rows(target.points, edge, _NUM_RANDOM, seed + 1)
         self._threshold = inlier_threshold
         self._points, self._normals = source.points[chosen], source.normals[chosen]
         # Products of float32 differ in their last bits with the number of threads; those of float64, rounded,
@@ -147,7 +148,7 @@ class Verifier:
         self._num_random = similarity.shape[1]
         self._lift = _LIFT * np.arange(len(similarity))
         self._random_similarity = (np.sort(similarity, axis=1) + self._lift[:, None]).ravel()
-        self._back = target.points[np.sort(rng.permutation(len(target))[:num_queries])]
+        self._back = target.points[drawn_rows(target.points, edge, num_queries, seed + 2)]
         self._signed = source.viewpoint is not None and target.viewpoint is not None
         views = [
             RangeImage.of(cloud.points, cloud.viewpoint)

@@ -180,7 +180,7 @@ def truth_drift(room: Room, config: RegistrationConfig) -> FloatArray:
         surfaces[key] = Surface.of(registrar.pipeline.prepare(cloud, size, view, StageClock()))
         origins[key] = cloud.origin
         poses[key] = shift_frames(truth[scan.name], -cloud.origin, np.zeros(3))
-    overlaps = Overlaps({key: surface.points for key, surface in surfaces.items()})
+    overlaps = Overlaps({key: surface.points for key, surface in surfaces.items()}, size)
     for _ in range(3):
         poses = align_scans(poses, surfaces, overlaps, size)
     group = {f"cloud_bin_{key}": shift_frames(T, origins[key], np.zeros(3)) for key, T in poses.items()}

@@ -78,6 +78,19 @@ def test_refining_several_before_the_choice_saves_one_that_lay_off(pair):
     assert rotation_error_deg(asked.decide(3).T_target_source, pair[1]) < 1
 
 
+def test_what_refines_to_the_answer_is_no_rival(pair):
+    """A motion that was proposed 18 degrees off the answer leads to it: how well it scores says nothing."""
+    near, far = off(pair[1], 18, 0.02), off(pair[1], 90, 0.3)
+    asked = selection(pair)
+    asked.add([off(pair[1], 0.3, 0.0), near, far])
+    found = asked.decide()
+    assert near.score > far.score
+    assert found.alternative in (far, far.refined)
+    alone = selection(pair)
+    alone.add([off(pair[1], 0.3, 0.0), off(pair[1], 18, 0.02)])
+    assert alone.decide().alternative is None
+
+
 def test_without_verification_the_first_of_the_first_lot_is_the_answer(pair):
     asked = selection(pair, "scoring.scorers=[]", "refinement.name=none")
     asked.add([off(pair[1], 90, 1.0), off(pair[1], 0, 0.0)])

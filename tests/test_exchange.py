@@ -44,7 +44,7 @@ PAIRS = [
 
 
 def pair_of(kind, parts):
-    source, target, T = parts
+    source, target, _ = parts
     if kind == "far away":
         return source + UTM, target + 2 * UTM
     if kind == "scaled":
@@ -74,7 +74,7 @@ def check_turned_round(answer, back):
     assert (one is None) == (other is None)
     if one is not None:
         np.testing.assert_allclose(other["T_target_source"], one["T_target_source"], atol=1e-9)
-        assert other["relative_score"] == one["relative_score"]
+        assert other["relative_score"] == pytest.approx(one["relative_score"], rel=1e-9)
     # An array has its name from its role.
     for fields in (expected, found):
         for side in ("source", "target"):

@@ -15,7 +15,7 @@ from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import PreparationConfig, RegistrationConfig
 from geomoe3d.data.sample import make_sample_pair
-from geomoe3d.decision.selection import Selection, clearly_different
+from geomoe3d.decision.selection import Selection, are_different, distinct
 from geomoe3d.errors import InputError
 from geomoe3d.features.base import with_features
 from geomoe3d.features.fpfh import FpfhDescriptor
@@ -315,11 +315,10 @@ def test_another_motion_is_one_that_shifts_or_turns_clearly(pair) -> None:
         return Hypothesis(R @ T, 0.0, 0)
 
     same = [around_centre(0), around_centre(14.9), around_centre(0, 0.29), around_centre(14, 0.28)]
-    assert clearly_different(same, T, source, 0.3) is None
-    assert clearly_different([], T, source, 0.3) is None
+    assert not any(are_different(T, h.T_target_source, source, 0.3) for h in same)
     for other in (around_centre(15.1), around_centre(0, 0.31), around_centre(180)):
-        later = around_centre(90)
-        assert clearly_different([*same, other, later], T, source, 0.3) is other
+        assert are_different(T, other.T_target_source, source, 0.3)
+        assert distinct([Hypothesis(T), *same, other], source, 0.3, 5)[1] is other
 
 
 def test_hypotheses_asked_together_get_what_each_gets_alone(pair, verifier: Verifier) -> None:

@@ -243,7 +243,7 @@ class Selection:
 def distinct(
     ranked: Iterable[Hypothesis], source: PreparedCloud, max_shift: float, limit: int
 ) -> list[Hypothesis]:
-    """The best hypotheses that are all different transforms, at most ``limit``; see `clearly_different`."""
+    """The best hypotheses that are all different transforms, at most ``limit``; see `are_different`."""
     chosen: list[Hypothesis] = []
     for hypothesis in ranked:
         if len(chosen) == limit:
@@ -252,22 +252,6 @@ def distinct(
         if all(are_different(c.T_target_source, T, source, max_shift) for c in chosen):
             chosen.append(hypothesis)
     return chosen
-
-
-def clearly_different(
-    ranked: Iterable[Hypothesis], T_target_source: FloatArray, source: PreparedCloud, max_shift: float
-) -> Hypothesis | None:
-    """The first hypothesis that is another transform than the given one, or None; see `are_different`.
-
-    Args:
-        ranked: candidates, best first.
-        T_target_source: (4, 4) the transform to differ from.
-        source, max_shift: as in `are_different`.
-    """
-    for hypothesis in ranked:
-        if are_different(T_target_source, hypothesis.T_target_source, source, max_shift):
-            return hypothesis
-    return None
 
 
 def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_shift: float) -> bool:

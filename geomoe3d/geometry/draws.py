@@ -30,7 +30,7 @@ def mixed(values: Ranks) -> Ranks:
 
 
 def cell_ranks(points: FloatArray, cell: float, seed: int) -> Ranks:
-    """(N,) random numbers, the same for points (N, k) in the same cell of a lattice with a corner at `OFF_ROUND` cells."""
+    """(N,) random numbers, equal for points (N, k) in one cell of a lattice with a corner at `OFF_ROUND` cells."""
     ranks: Ranks = mixed(np.full(len(points), seed % 2**64, dtype=np.uint64) + _STEP)
     for column in points.T:
         # Numbers beyond 64 bits are no cells of a cloud; they wrap round, as a rank may.

@@ -28,7 +28,9 @@ def scans(kind):
         return first, cut(scene(), 2.0, 4.5, seed=1)[0]
     if kind == "unrelated":
         return first, cut(scene(77), 0.0, 3.0, seed=8)[0]
-    if kind == "rounded":  # to a fraction of the voxel: coordinates on its walls, were these round numbers too
+    if (
+        kind == "rounded"
+    ):  # to a fraction of the voxel: coordinates on its walls, were these round numbers too
         return np.round(first, 2), np.round(cut(scene(), 0.6, 4.0, seed=1)[0], 2)
     return surfaces("channel", count=4000), transform_points(motion(3), surfaces("channel", 1, 3500))
 

@@ -79,6 +79,9 @@ def check_turned_round(answer, back):
     for fields in (expected, found):
         for side in ("source", "target"):
             del fields[side]["name"]
+    one, other = expected.pop("accuracy"), found.pop("accuracy")
+    assert (one is None) == (other is None)
+    assert one is None or other == pytest.approx(one, rel=1e-6)
     evidence, measured = expected.pop("evidence"), found.pop("evidence")
     assert measured == pytest.approx(evidence, rel=1e-12)
     assert (

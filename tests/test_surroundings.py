@@ -204,7 +204,7 @@ def test_planes_find_inliers_that_lengths_alone_do_not() -> None:
         for found, near in ((alone, None), (helped, around)):
             guesses = ConsensusEstimator()(given.points, inlier_threshold=THRESHOLD, surroundings=near)
             found.append(any(rotation_error_deg(h.T_target_source, T) < 5 for h in guesses))
-    assert all(helped) and not all(alone)
+    assert sum(helped) >= 9 > sum(alone), (helped, alone)
 
 
 def two_motions(seed: int) -> tuple[Correspondences, Surroundings, np.ndarray, np.ndarray]:

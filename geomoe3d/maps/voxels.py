@@ -2,7 +2,7 @@
 
 The bottom of a map. Each voxel holds the sum and number of its points and, where the sensors are known, the sum of
 the directions to them, so pieces may come in any order and scans may be added later; the means are those that
-`geomoe3d.clouds.prepare.voxel_means` gives of the whole. 64 bytes per voxel; a million points take some 0.3 s.
+a plain mean of the whole gives. 64 bytes per voxel; a million points take some 0.3 s.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A cloud of any size as the sums of its voxels: read in pieces, added to, made coarser.
 
 The bottom of a map. Each voxel holds the sum and number of its points and, where the sensors are known, the sum of
-the directions to them, so pieces may come in any order and scans may be added later; the means are those that
-a plain mean of the whole gives. 64 bytes per voxel; a million points take some 0.3 s.
+the directions to them, so pieces may come in any order and scans may be added later; its means are those of the
+whole. 64 bytes per voxel; a million points take some 0.3 s.
 """
 
 from __future__ import annotations

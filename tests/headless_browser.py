@@ -34,6 +34,7 @@ BEFORE = """<script>
 window.requestAnimationFrame = (f) => setTimeout(() => f(performance.now()), 16);
 window.IntersectionObserver = class {
   constructor(call) { this.call = call; }
+  unobserve() {}
   observe(target) { setTimeout(() => this.call([{ target, isIntersecting: true }]), 10); }
 };
 </script>"""

@@ -192,7 +192,12 @@ CHOOSE = """
   form.elements.confidence.value = "1"; form.elements.find.value = "C.NPY"; note("found");
   form.elements.find.value = "";
   document.querySelector('[name="status"][value="error"]').checked = false; note("registered");
-  document.body.dataset.log = JSON.stringify(log);
+  log.early = document.querySelectorAll("img[src]").length;
+  setTimeout(() => {
+    const shown = [...document.querySelectorAll("img[src]")];
+    log.late = shown.filter((picture) => picture.complete && picture.naturalWidth).length;
+    document.body.dataset.log = JSON.stringify(log);
+  }, 500);
 })();
 """
 
@@ -208,6 +213,7 @@ def test_the_page_sorts_and_filters(finished, tmp_path):
     assert set(log["unsure"]) == {k for k, value in sure.items() if value == 0} == failed
     assert {"ac", "bc"} <= set(log["found"]) and "ab" not in log["found"]
     assert set(log["registered"]) == set(sure) - failed
+    assert (log["early"], log["late"]) == (0, 3)  # pictures are decoded as they come into view
 
 
 def test_pages_of_the_pairs_and_of_those_that_left_the_table(scans, copied, tmp_path):

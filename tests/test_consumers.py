@@ -215,6 +215,19 @@ def test_meshlab_opens_an_aligned_cloud(tmp_path: Path, moved: np.ndarray, preci
     assert meshes.current_mesh().vertex_number() == 100  # flags would hide half of them
 
 
+@pytest.mark.parametrize("name", ["moved.asc", "moved.e57", "bare.xyz"])
+def test_meshlab_opens_other_clouds(tmp_path: Path, moved: np.ndarray, name: str) -> None:
+    pymeshlab = needed("pymeshlab")
+    notes: list[str] = []
+    save_aligned(tmp_path / "bare.xyz", small_cloud(), rigid(), remark=notes.append)
+    assert not notes
+    save_aligned(tmp_path / "full.xyz", tmp_path / "source.npz", rigid(), remark=notes.append)
+    assert len(notes) == 1 and "MeshLab" in notes[0]
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.load_new_mesh(str(tmp_path / name))
+    np.testing.assert_allclose(meshes.current_mesh().vertex_matrix(), moved, atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".off", ".stl", ".ply", ".glb"])
 def test_meshlab_opens_an_aligned_mesh(tmp_path: Path, suffix: str) -> None:
     pymeshlab, trimesh = needed("pymeshlab"), needed("trimesh")

@@ -263,6 +263,10 @@ def _save_aligned(
         elif not single:
             remark(_WITH_PRECISION[suffix].format(path=path))
         write = partial(write, single=single, note=note)
+    if suffix == ".xyz" and (moved.normals is not None or moved.colors is not None or moved.fields):
+        remark(
+            f"{path} begins with a header, which MeshLab takes for a point, or shows none; PLY, ASC and E57 suit it"
+        )
     _write(path, lambda handle: lost.extend(write(handle, moved)), force)
     return tuple(dict.fromkeys(lost))
 

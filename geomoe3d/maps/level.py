@@ -1,4 +1,4 @@
-"""A map on one grid: points with normals, and at every fourth of them what is compared with a scan.
+"""A map on one grid: points with normals, and what is compared with a scan at each of them.
 
 Scans of other sizes want other grids, so a map may hold several levels. FPFH of three reaches (`features.multiscale`)
 finds two to three times as many true matches in a whole room as FPFH does; its 99 numbers are brought to 32 by the
@@ -27,11 +27,20 @@ from geomoe3d.types import BoolArray, Float32Array, FloatArray, IntArray, Prepar
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_SPACING = 2  # voxels between the points that are compared: an inlier may be two voxels off
+SPACING = 2  # voxels between the points that are compared: an inlier may be two voxels off
 _DIRECTIONS = 32
 _SAMPLE = 20_000  # features from which the principal directions are found
 _KNOWN = 0.1  # length of a mean direction to the sensors below which they saw a surface from everywhere
 _LEAST = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """K surfaces of a map as they are compared: ``points``, ``normals`` (K, 3) and ``features`` (K, 32)."""
+
+    points: FloatArray
+    normals: FloatArray
+    features: Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +50,20 @@ class Level:
     Attributes:
         voxel_size: edge of the grid, cloud units.
         points, normals: (n, 3); the normals face the sensors where these are known, else the way their neighbours do.
-        key_points, key_normals: (K, 3) what is compared; a point whose side is not known is there twice, once for
-            each.
-        key_features: (K, 32) float32 of about length 1, see `described`.
+        features: (n, 32) float32 of about length 1 along the directions.
+        twins: (m,) rows of the points whose side is not known.
+        twin_features: (m, 32) of these, seen from the other side.
+        coarse: (c,) one row per two voxels: what is compared first.
         directions: (99, 32) principal directions of the features, orthonormal.
     """
 
     voxel_size: float
     points: FloatArray
     normals: FloatArray
-    key_points: FloatArray
-    key_normals: FloatArray
-    key_features: Float32Array
+    features: Float32Array
+    twins: IntArray
+    twin_features: Float32Array
+    coarse: IntArray
     directions: Float32Array
 
     @classmethod
@@ -82,19 +93,11 @@ class Level:
         bare = PreparedCloud(points, normals, None, voxel_size, None, voxels.origin)
         features = with_features(bare, MultiscaleDescriptor()).features
         assert features is not None
-        rows = one_per_voxel(bare, _SPACING)
-        features, unsure = features[rows], np.flatnonzero(~known[rows])
-        features = np.concatenate([features, both_sides(features[unsure])])
+        twins = np.flatnonzero(~known)
         directions = _principal(features, seed)
-        return cls(
-            voxel_size,
-            points,
-            normals,
-            np.concatenate([points[rows], points[rows[unsure]]]),
-            np.concatenate([normals[rows], -normals[rows[unsure]]]),
-            np.ascontiguousarray(features @ directions),
-            directions,
-        )
+        turned = both_sides(features[twins])
+        found = np.ascontiguousarray(features @ directions), twins, np.ascontiguousarray(turned @ directions)
+        return cls(voxel_size, points, normals, *found, one_per_voxel(bare, SPACING), directions)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -103,15 +106,22 @@ class Level:
 
         return cKDTree(self.points)
 
-    def described(self, scan: PreparedCloud, features: Float32Array) -> tuple[IntArray, Float32Array]:
-        """Rows of a scan's points that are compared, as the map's, and their features (k, 32).
+    def sides(self, rows: IntArray) -> Sides:
+        """Some of the points (rows rising) as they are compared: those whose side is not known twice, for each side."""
+        place = np.searchsorted(self.twins, rows)
+        place[place == len(self.twins)] = 0
+        twice = place[self.twins[place] == rows] if len(self.twins) else place[:0]
+        of = self.twins[twice]
+        return Sides(
+            np.concatenate([self.points[rows], self.points[of]]),
+            np.concatenate([self.normals[rows], -self.normals[of]]),
+            np.concatenate([self.features[rows], self.twin_features[twice]]),
+        )
 
-        Args:
-            scan: on the level's grid, normals turned to its sensor.
-            features: (n, 99) of its points, by `MultiscaleDescriptor`.
-        """
-        rows = one_per_voxel(scan, _SPACING)
-        return rows, np.ascontiguousarray(features[rows] @ self.directions)
+    @cached_property
+    def first(self) -> Sides:
+        """What is compared first."""
+        return self.sides(self.coarse)
 
 
 def described_twice(scan: PreparedCloud, describe: Descriptor) -> tuple[PreparedCloud, Float32Array]:

@@ -23,7 +23,7 @@ from geomoe3d.decision.confidence import judge, lead_over
 from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
 from geomoe3d.features.base import with_features
-from geomoe3d.geometry.se3 import inverse, motions_apart, transform_points
+from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Level
 from geomoe3d.maps.places import Query
 from geomoe3d.pipeline import Pipeline
@@ -32,8 +32,9 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, PreparedCloud
 
 _FIRST_WINDOWS, _WINDOWS, _MORE_WINDOWS = 6, 12, 40
-_PLAIN = 0.6  # a quick score that hardly any wrong motion reaches: no more windows are looked into
-_KEPT = 10  # distinct candidates
+_PLAIN = 0.65  # a quick score that hardly any wrong motion reaches: no more windows are looked into
+_KEPT, _POLISHED = 12, 8  # distinct candidates, and how many of them are drawn closer
+_POLISHING = (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)  # voxels within which points are matched, step by step
 _PER_WINDOW = 6
 _ASKED, _ASKED_BACK = 400, 800
 _LEAST_COSINE = 0.7
@@ -115,9 +116,9 @@ class Search:
         self._clock("propose")
         scored = [(self._quick(T), Hypothesis(T)) for T in given]
         for number, window in enumerate(windows):
-            if number >= _FIRST_WINDOWS and not more and max((q for q, _ in scored), default=0.0) > _PLAIN:
+            if number >= _FIRST_WINDOWS and max((q for q, _ in scored), default=0.0) > _PLAIN:
                 break
-            proposed = self._query.motions(window, _PER_WINDOW)
+            proposed = self._query.motions(window, _PER_WINDOW, fine=more)
             if near is not None:
                 proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
             scored += [(self._quick(h.T_target_source), h) for h in proposed]
@@ -128,7 +129,13 @@ class Search:
                 break
             if all(self.differ(hypothesis, other) for _, other in chosen):
                 chosen.append((score, hypothesis))
-        return chosen
+        polished = [Hypothesis(self._polished(h.T_target_source)) for _, h in chosen[:_POLISHED]]
+        both = [*chosen, *((self._quick(h.T_target_source), h) for h in polished)]
+        best: list[tuple[float, Hypothesis]] = []
+        for score, hypothesis in sorted(both, key=lambda item: -item[0]):
+            if all(self.differ(hypothesis, other) for _, other in best):
+                best.append((score, hypothesis))
+        return best
 
     def differ(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two motions are clearly different."""
@@ -183,6 +190,30 @@ class Search:
 
     def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
         return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]
+
+    def _polished(self, T: FloatArray) -> FloatArray:
+        """A motion drawn closer by a few steps of point-to-plane alignment on the points of the quick look."""
+        from scipy.spatial.transform import Rotation
+
+        level = self._level
+        points, normals = self.scan.points[self._rows], self.scan.normals[self._rows]
+        for reach in _POLISHING:
+            moved = transform_points(T, points)
+            distance, nearest = level.tree.query(moved, distance_upper_bound=reach * level.voxel_size)
+            hit = np.flatnonzero(np.isfinite(distance))
+            there = level.normals[np.asarray(nearest)[hit]]
+            hit_normals = normals[hit] @ T[:3, :3].T
+            alike = np.abs(np.einsum("ij,ij->i", hit_normals, there)) > _LEAST_COSINE
+            hit, there = hit[alike], there[alike]
+            if len(hit) < 6:
+                return T
+            center = moved[hit].mean(0)
+            gaps = np.einsum("ij,ij->i", level.points[np.asarray(nearest)[hit]] - moved[hit], there)
+            J = np.hstack([np.cross(moved[hit] - center, there), there])
+            step = np.linalg.solve(J.T @ J + 1e-3 * np.eye(6), J.T @ gaps)
+            turn = Rotation.from_rotvec(step[:3]).as_matrix()
+            T = make_transform(turn, center + step[3:] - turn @ center) @ T
+        return T
 
     def _quick(self, T: FloatArray) -> float:
         """Share of the scan's points that lie on the map with an agreeing plane, times exp(-10 v), v the share of map

@@ -348,7 +348,7 @@ class Map:
         if best is None or best.decision.answer is None:
             return None, []
         decision = best.decision
-        read = (given, self.name), best.pair.clouds, min(wanted, level.voxel_size), view is not None
+        read = (given, self.name), best.pair.clouds, level.voxel_size, view is not None
         told_of = remarks(*read, preparation, decision.judgement)
         prior = self._prior_notes(search, decision.T_target_source, near, local)
         for sentence in (*cloud.notes, *prior, *told_of):

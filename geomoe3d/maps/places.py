@@ -14,10 +14,11 @@ import numpy as np
 
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.surroundings import Surroundings
-from geomoe3d.maps.level import Level
+from geomoe3d.features.pyramid import one_per_voxel
+from geomoe3d.maps.level import SPACING, Level, Sides
+from geomoe3d.matching.nearest import nearest_features
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import (
-    BoolArray,
     Correspondences,
     Float32Array,
     FloatArray,
@@ -27,8 +28,10 @@ from geomoe3d.types import (
 )
 
 _ASKED = 1000  # points of the scan
-_MATCHES = 500  # of a window, from which motions are proposed
-_THRESHOLD = 3.0  # voxels: keypoints are two apart
+_MATCHES, _FINE_MATCHES = 500, 1000  # of a window, from which motions are proposed
+_THRESHOLD, _FINE_THRESHOLD = 3.0, 2.0  # voxels: what is compared first is two apart
+_QUICK = ConsensusEstimator(num_hypotheses=6, num_seeds=250, num_refined=30)
+_FINE = ConsensusEstimator(num_hypotheses=6, num_seeds=500, num_refined=60)
 _ROWS = 50
 """Points of the scan whose similarities to all of the map are held at once."""
 
@@ -39,7 +42,7 @@ class Window:
 
     Attributes:
         center: (3,) local coordinates of the map.
-        keys: rows of the compared points in it.
+        keys: rows in it of what is compared first.
         votes: how much better the scan's points match there than elsewhere; larger is likelier.
     """
 
@@ -59,11 +62,13 @@ class Query:
     """
 
     def __init__(self, scan: PreparedCloud, features: Float32Array, level: Level, *, seed: int = 0) -> None:
-        rows, features = level.described(scan, features)
+        rows = one_per_voxel(scan, SPACING)
         chosen = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_ASKED])
         self.level, self.seed = level, seed
-        self.points, self.normals = scan.points[rows[chosen]], scan.normals[rows[chosen]]
-        self.features = features[chosen]
+        of = np.ascontiguousarray(features @ level.directions)
+        self._all = Sides(scan.points, scan.normals, of)
+        some = rows[chosen]
+        self._some = Sides(scan.points[some], scan.normals[some], of[some])
         self.radius = float(np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), 0.95))
 
     @single_blas_thread()
@@ -74,30 +79,30 @@ class Query:
             count: at most so many.
             within: (3,) where the scan's centre is said to lie, local coordinates, and how far off at most.
         """
-        level, edge = self.level, self.radius / 1.5
-        cells = np.floor(level.key_points / edge).astype(np.int64)
+        level, edge, asked = self.level.first, self.radius / 1.5, self._some.features
+        cells = np.floor(level.points / edge).astype(np.int64)
         cells -= cells.min(0)
         shape = cells.max(0) + 1
         flat = np.ravel_multi_index(tuple(cells.T), tuple(shape))
         order = np.argsort(flat, kind="stable")
         starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
         used = flat[order][starts]
-        sorted_features = np.ascontiguousarray(level.key_features[order].T)
+        sorted_features = np.ascontiguousarray(level.features[order].T)
         places = np.stack(np.unravel_index(used, tuple(shape)), axis=1)
         around = np.linalg.norm(places[:, None] - places[None], axis=2) * edge <= 1.25 * self.radius
         best = np.concatenate(
             each(
                 lambda start: np.maximum.reduceat(
-                    self.features[start : start + _ROWS] @ sorted_features, starts, axis=1
+                    asked[start : start + _ROWS] @ sorted_features, starts, axis=1
                 ),
-                range(0, len(self.features), _ROWS),
+                range(0, len(asked), _ROWS),
             )
         )
         members = [np.flatnonzero(row) for row in around]
         most = np.stack([best[:, m].max(1) for m in members], axis=1)  # (asked, windows)
         votes = _votes(most)
         counts = np.add.reduceat(np.ones(len(order)), starts)
-        sums = np.add.reduceat(level.key_points[order], starts, axis=0)
+        sums = np.add.reduceat(level.points[order], starts, axis=0)
         ends = np.append(starts[1:], len(order))
         found: list[Window] = []
         for k in np.argsort(-votes, kind="stable"):
@@ -113,28 +118,37 @@ class Query:
             found.append(Window(center, np.sort(keys), float(votes[k])))
         return found
 
-    def motions(self, window: Window, count: int) -> list[Hypothesis]:
-        """Motions into a window, best first, T_map_scan (4, 4) local coordinates of both."""
-        level = self.level
-        similarity = self.features @ level.key_features[window.keys].T
-        choice = similarity.argmax(1)
-        value = similarity[np.arange(len(choice)), choice]
-        mutual: BoolArray = value >= similarity.max(0)[choice]
-        order = np.lexsort((-value, ~mutual))[:_MATCHES]
-        rows, columns = order, window.keys[choice[order]]
+    def motions(self, window: Window, count: int, *, fine: bool = False) -> list[Hypothesis]:
+        """Motions into a window, best first, T_map_scan (4, 4) local coordinates of both.
+
+        Args:
+            window: where to.
+            count: at most so many.
+            fine: match all points of both, not one per two voxels: five times as long, and more is found.
+        """
+        if fine:
+            near = self.level.tree.query_ball_point(window.center, 1.5 * self.radius, return_sorted=True)
+            scan, there = self._all, self.level.sides(np.array(near, dtype=np.int64))
+        else:
+            first, keys = self.level.first, window.keys
+            scan, there = self._some, Sides(first.points[keys], first.normals[keys], first.features[keys])
+        index, distance, _, mutual = nearest_features(scan.features, there.features, 1, False)
+        choice, mutual_first = index[:, 0], mutual[:, 0]
+        rows = np.lexsort((distance[:, 0], ~mutual_first))[: _FINE_MATCHES if fine else _MATCHES]
+        columns = choice[rows]
         matched = Correspondences(
-            np.hstack([self.points[rows], level.key_points[columns]]),
-            normals=(self.normals[rows], level.key_normals[columns]),
+            np.hstack([scan.points[rows], there.points[columns]]),
+            normals=(scan.normals[rows], there.normals[columns]),
             normals_signed=True,
         )
-        threshold = _THRESHOLD * level.voxel_size
-        return ConsensusEstimator(num_hypotheses=count, num_seeds=250, num_refined=30)(
+        threshold = (_FINE_THRESHOLD if fine else _THRESHOLD) * self.level.voxel_size
+        return (_FINE if fine else _QUICK)(
             matched.points,
-            np.where(mutual[order], 1.0, 0.5),
+            np.where(mutual_first[rows], 1.0, 0.5),
             inlier_threshold=threshold,
             seed=self.seed,
             surroundings=Surroundings.of(matched, threshold),
-        )
+        )[:count]
 
 
 def _votes(most: Float32Array) -> FloatArray:

@@ -170,6 +170,10 @@ class SecondLookConfig(Section):
         description="where no sensor position is known, ask again with the source's normals turned over "
         "whenever the answer is not ok",
     )
+    mirror: bool = Field(
+        True,
+        description="ask once more with the source mirrored where the answer is not quite sure, to say so",
+    )
 
     @field_validator("grids")
     @classmethod
@@ -205,6 +209,11 @@ class RegistrationConfig(Section):
 
     voxel_size: float | None = Field(None, gt=0, description="cloud units; None chooses and reports one")
     seed: int = Field(0, ge=0, description="same files, same seed: same answer")
+    scale: Literal["fixed", "estimate"] = Field(
+        "fixed",
+        description="fixed: both clouds are in one unit; estimate: the ratio of their lengths is unknown, 1/1000 to "
+        "1000, and the answer is a similarity",
+    )
     preparation: PreparationConfig = PreparationConfig()
     descriptor: DescriptorConfig = DescriptorConfig()
     matching: MatchingConfig = MatchingConfig()

@@ -16,7 +16,7 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.clouds.viewpoint import believed_viewpoints
 from geomoe3d.config import RegistrationConfig
-from geomoe3d.errors import InputError
+from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.geometry.draws import drawn_rows
@@ -208,8 +208,13 @@ def register_correspondences(
 
     Raises:
         InputError: no (N, 6) of finite numbers, or a voxel size that is not a positive length.
+        ConfigError: the scale is to be estimated, which needs the clouds.
         ConfigError, CheckpointError, DependencyError: as `CorrespondenceRegistrar`.
     """
+    if config is not None and config.scale != "fixed":
+        raise ConfigError(
+            f"scale: {config.scale} needs the clouds; correspondences alone give a rigid motion"
+        )
     return CorrespondenceRegistrar(config)(correspondences, voxel_size=voxel_size)
 
 

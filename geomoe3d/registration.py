@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import replace
 from typing import Any, Literal, overload
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.loading import without_missing
 from geomoe3d.clouds.order import in_order
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import (
@@ -32,9 +34,10 @@ from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
-from geomoe3d.decision.remarks import remarks
+from geomoe3d.decision.remarks import data_remarks, remarks
 from geomoe3d.decision.scale import likely_unit_ratio, measure_scale, seeming_units
 from geomoe3d.decision.selection import Selection
+from geomoe3d.decision.similarity import as_similarity, find_similarity, mirrored_cloud, scaled_cloud
 from geomoe3d.errors import ConfigError, EmptyCloudError, InputError
 from geomoe3d.features.cache import FeatureCache
 from geomoe3d.geometry.se3 import check_motion, inverse
@@ -48,6 +51,8 @@ from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, PointCloud
 _LARGER = 3.0
 """Ratio of the voxel sizes that two clouds would get by themselves from which the larger is taken for a map; of 1,941
 pairs of scans measured the largest was 2.6, of a depth camera's view in its room three to four."""
+_SURE = 0.99
+_CLEARLY_BETTER = 3.0  # times the score
 
 
 class Registrar:
@@ -62,6 +67,8 @@ class Registrar:
         CheckpointError: trained weights are missing, broken or do not fit.
         DependencyError: a library that a part needs is not installed.
     """
+
+    _names_units, _looks_once = True, False
 
     def __init__(
         self, config: RegistrationConfig | None = None, *, cache: FeatureCache | None = None
@@ -156,6 +163,8 @@ class Registrar:
 
         Arguments and errors are those of `geomoe3d.register`.
         """
+        if self.config.scale == "estimate":
+            return self._explain_scaled(source, target, initial, correspondences, progress)
         config, seed, clock = self.config, self.config.seed, StageClock(progress)
         if initial is not None and not config.scoring.scorers:
             raise ConfigError(
@@ -163,7 +172,8 @@ class Registrar:
                 "one of the two out"
             )
         clock("load")
-        clouds = _load(source, "source", seed), _load(target, "target", seed)
+        loaded = _load(source, "source", seed), _load(target, "target", seed)
+        clouds = without_missing(loaded[0]), without_missing(loaded[1])
         for cloud in clouds:
             check_cloud(cloud)
         rows = None if correspondences is None else check_rows(correspondences)
@@ -172,14 +182,15 @@ class Registrar:
         if mismatch is not None:
             reason = self._units(clouds, clock) or mismatch
             failed = failed_result(clouds, reason, config, clock.stop())
-            return Explanation(failed, *clouds).remembering(source, target)
+            return Explanation(failed, *loaded).remembering(source, target)
         exchanged = not in_order(*clouds)
         if exchanged:
             clouds = clouds[1], clouds[0]
             guess = None if guess is None else inverse(guess)
             rows = None if rows is None else np.roll(rows, 3, axis=1)
         found = self._explained((source, target), clouds, clock, guess, rows, exchanged)
-        return (found.exchanged() if exchanged else found).remembering(source, target)
+        found = found.exchanged() if exchanged else found
+        return replace(found, source=loaded[0], target=loaded[1]).remembering(source, target)
 
     def _explained(
         self,
@@ -223,17 +234,18 @@ class Registrar:
         if decision.answer is not None:
             scale = measure_scale(decision.T_target_source, *pair.clouds)
             decision = decision.with_scale(scale, exchanged=exchanged)
-            told = measure_accuracy(
-                decision.T_target_source, *pair.clouds, pair.matched, pair.inlier_threshold
-            )
-            decision = replace(decision, accuracy=told)
+            decision = _with_accuracy(decision, pair)
         if decision.judgement.status != "ok":
             units = self._units(clouds[::-1] if exchanged else clouds, clock)
             if units is not None:
                 decision = decision.with_note(units, first=True)
+        mirrored = self._mirrored(clouds, decision, clock)
+        if mirrored is not None:
+            decision = decision.doubted(mirrored)
         read = data, pair.clouds, wanted, places is not None
         told_of = remarks(*read, config.preparation, decision.judgement)
-        for remark in (*clouds[0].notes, *clouds[1].notes, *told_of):
+        causes = () if decision.judgement.status == "ok" else data_remarks(clouds, wanted, config.preparation)
+        for remark in (*clouds[0].notes, *clouds[1].notes, *causes, *told_of):
             decision = decision.with_note(remark)
         if NETWORK in self.pipeline.scorers:
             opinion = opinion_of(decision.answer)
@@ -245,7 +257,8 @@ class Registrar:
 
     def _is_map(self, sizes: tuple[float, float]) -> bool:
         """Whether one cloud is so much larger or sparser than the other that what both share is a small part of it."""
-        return max(sizes) >= _LARGER * min(sizes) and bool(self.pipeline.scorers)
+        one_scale = self._names_units  # not a ratio that is tried
+        return one_scale and max(sizes) >= _LARGER * min(sizes) and bool(self.pipeline.scorers)
 
     def _in_map(
         self, clouds: tuple[PointCloud, PointCloud], guess: FloatArray | None, clock: StageClock
@@ -258,7 +271,7 @@ class Registrar:
         if found is None or found.decision.answer is None:
             failed = failed_result(clouds, NOWHERE, self.config, clock.stop())
             return Explanation(failed, *clouds)
-        pair, decision = found.pair, found.decision
+        pair, decision = found.pair, _with_accuracy(found.decision, found.pair)
         if decision.judgement.status != "ok" and (units := self._units(clouds, clock)) is not None:
             decision = decision.with_note(units, first=True)
         for remark in world.notes:
@@ -269,6 +282,56 @@ class Registrar:
         weighed = said or FilterOutput(np.zeros(len(pair.matched)))
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
+
+    def _explain_scaled(
+        self,
+        source: Any,
+        target: Any,
+        initial: ArrayLike | None,
+        correspondences: ArrayLike | None,
+        progress: Progress | None,
+    ) -> Explanation:
+        """`explain` where the ratio of lengths is unknown: a search over rigid answers."""
+        if initial is not None:
+            raise ConfigError(
+                "a first guess is a rigid motion and says nothing of the scale that is to be estimated (scale: "
+                "estimate); leave one of the two out"
+            )
+        clock = StageClock(progress)
+        clock("load")
+        clouds = _load(source, "source", self.config.seed), _load(target, "target", self.config.seed)
+        for cloud in clouds:
+            check_cloud(cloud)
+        rows = None if correspondences is None else check_rows(correspondences)
+        quick, thorough = self._rigid(second_look=False), self._rigid(second_look=True)
+
+        def attempt(ratio: float, thoroughly: bool) -> Explanation:
+            clock("scale")
+            shrunk = None if rows is None else rows / ([ratio] * 3 + [1.0] * 3)
+            smaller = scaled_cloud(clouds[0], 1 / ratio)
+            registrar = thorough if thoroughly else quick
+            return registrar.explain(smaller, clouds[1], correspondences=shrunk, progress=progress)
+
+        best = find_similarity(*clouds, attempt)
+        if best is None:
+            extents = [robust_extent(cloud.points) for cloud in clouds]
+            reason = (
+                f"the extents of '{clouds[0].name}' and '{clouds[1].name}' are {extents[0]:.4g} and {extents[1]:.4g}; "
+                "a scale between 1/1000 and 1000 is sought, so bring them nearer to one unit first"
+            )
+            failed = failed_result(clouds, reason, self.config, clock.stop())
+            return Explanation(failed, *clouds).remembering(source, target)
+        found, ratio = best
+        stages = {**found.result.seconds, **clock.stop()}
+        result = replace(found.result, config=self.config.model_dump(mode="json"), seconds=stages)
+        return as_similarity(found, ratio, clouds[0], result).remembering(source, target)
+
+    def _rigid(self, *, second_look: bool) -> Registrar:
+        """This registrar for one scale: it asks about no units, and without ``second_look`` looks once."""
+        rigid = copy(self)
+        rigid.config = self.config.model_copy(update={"scale": "fixed"})
+        rigid._names_units, rigid._looks_once = False, not second_look
+        return rigid
 
     def _look(
         self,
@@ -331,13 +394,11 @@ class Registrar:
         """
         source, target = clouds
         ratio = likely_unit_ratio((robust_extent(source.points), robust_extent(target.points)))
-        if ratio is None or not self.pipeline.scorers:
+        if ratio is None or not self.pipeline.scorers or not self._names_units:
             return None
         clock("units")
-        sensor = None if source.sensor is None else source.sensor / ratio
-        smaller = replace(source, points=source.points / ratio, origin=source.origin / ratio, sensor=sensor)
         try:
-            fits = self.register(smaller, target).ok
+            fits = self.register(scaled_cloud(source, 1 / ratio), target).ok
         except EmptyCloudError:  # next to nothing is left of it on the grid that was asked for
             return None
         if not fits:
@@ -350,14 +411,37 @@ class Registrar:
     def _is_described_again(self, judgement: Judgement) -> bool:
         """Whether the second descriptor is to be asked."""
         known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
-        return known and judgement.status != "ok"
+        return known and judgement.status != "ok" and not self._looks_once
+
+    def _mirrored(
+        self, clouds: tuple[PointCloud, PointCloud], decision: Decision, clock: StageClock
+    ) -> str | None:
+        """A sentence where the clouds fit clearly better once the source is mirrored.
+
+        One more registration, a quick one, where the answer is not quite sure.
+        """
+        judgement, look = decision.judgement, self.config.second_look
+        wanted = look.mirror and self._names_units and bool(self.pipeline.scorers)
+        if not wanted or (judgement.status == "ok" and judgement.confidence > _SURE):
+            return None
+        clock("mirrored")
+        turned = mirrored_cloud(clouds[0])
+        found = self._rigid(second_look=False).register(turned, clouds[1])
+        score = 0.0 if decision.answer is None else decision.answer.score
+        if not found.ok or found.evidence["score"] < _CLEARLY_BETTER * score:
+            return None
+        return (
+            f"mirrored: with x of '{clouds[0].name}' the other way round the clouds fit (confidence "
+            f"{found.confidence:.2f}); a rigid motion cannot mirror, so bring both to right-handed axes (often two "
+            "axes are exchanged)"
+        )
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""
         look = self.config.second_look
         doubtful = judgement.status != "ok" and judgement.confidence < look.below
         wanted = bool(look.grids) or look.max_correspondences > 0
-        return doubtful and bool(self.pipeline.scorers) and wanted
+        return doubtful and bool(self.pipeline.scorers) and wanted and not self._looks_once
 
     def _other_sides(self, prepared: Clouds, places: Places) -> Iterator[Sides]:
         """Which other sides of normals a pair that is not ok is asked with.
@@ -367,7 +451,7 @@ class Registrar:
         objects, meshes and merged scans, which no sensor saw as a whole; where sensors are believed, only if the
         normals that follow from that contradict themselves.
         """
-        if not self.config.second_look.flip or not self.pipeline.scorers:
+        if not self.config.second_look.flip or not self.pipeline.scorers or self._looks_once:
             return
         if places is None:
             yield "flipped"
@@ -388,9 +472,11 @@ def register(
 ) -> RegistrationResult:
     """The rigid transform p_target = R p_source + t that maps source into target; no first guess is needed.
 
+    With ``scale="estimate"`` a similarity, p_target = scale R p_source + t.
+
     Args:
         source: path, (N, 3) array or tensor, Open3D or trimesh cloud or mesh, or `PointCloud`.
-        target: likewise, in the same unit of length.
+        target: likewise, in the same unit of length unless the scale is estimated.
         config: complete configuration; None takes the defaults.
         initial: (4, 4) a first guess in the files' coordinates, or None; scored like all others, not trusted.
         correspondences: (N, 6) matches of your own, rows [source xyz, target xyz] in the files' coordinates,
@@ -407,13 +493,19 @@ def register(
     Raises:
         InputError: a cloud that cannot be read or has too few usable points, a guess that is no rigid
             transform, or correspondences that are no (N, 6) finite numbers.
-        ConfigError: an unknown or invalid override, or a guess where nothing scores.
+        ConfigError: an unknown or invalid override, or a guess where nothing scores or the scale is estimated.
     """
     if overrides:
         tree = (config or RegistrationConfig()).model_dump()
         config = build_config(RegistrationConfig, {**tree, **overrides}, "register(...)")
     given: dict[str, Any] = {"initial": initial, "correspondences": correspondences, "progress": progress}
     return Registrar(config).register(source, target, **given)
+
+
+def _with_accuracy(decision: Decision, pair: Pair) -> Decision:
+    """The same decision, which has an answer, with its accuracy."""
+    T = decision.T_target_source
+    return replace(decision, accuracy=measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold))
 
 
 def _load(data: Any, role: str, seed: int) -> PointCloud:

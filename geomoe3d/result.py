@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -31,7 +31,7 @@ class CloudReport:
     Attributes:
         name: file name or a given label.
         num_input: points given.
-        num_non_finite: dropped for a NaN or infinite coordinate.
+        num_non_finite: dropped for a NaN or infinite coordinate, or as missing at exactly (0, 0, 0).
         num_duplicates: dropped because another point has exactly the same coordinates.
         num_isolated: voxels dropped because no neighbour is close enough to fit a normal.
         num_points: voxel points used.
@@ -80,7 +80,7 @@ class Accuracy:
         distance_mean, distance_median, distance_std, distance_p95: mean, median, standard deviation and 95 %
             quantile of the distances.
         sigma_center: deviation of where the transform puts the centre of the overlap.
-        sigma_farthest: deviation of where it puts the source point that is farthest from that centre.
+        sigma_farthest: deviation of where it puts the place of the point, of either cloud, farthest from that centre.
         sigma_rotation_deg: deviation of its rotation, degrees.
     """
 
@@ -95,9 +95,16 @@ class Accuracy:
     sigma_farthest: float
     sigma_rotation_deg: float
 
-    def exchanged(self) -> Accuracy:
-        """Of the inverse: the overlaps change places; the deviations stay those measured on the source."""
-        return replace(self, overlap_source=self.overlap_target, overlap_target=self.overlap_source)
+    def exchanged(self, scale: float = 1.0) -> Accuracy:
+        """Of the inverse: the overlaps change places, and lengths are in the unit of the old source.
+
+        Args:
+            scale: of the similarity.
+        """
+        ours = {f.name: getattr(self, f.name) for f in fields(self)}
+        lengths = {n: v / scale for n, v in ours.items() if n.startswith(("inlier", "distance", "sigma"))}
+        shares = {"overlap_source": self.overlap_target, "overlap_target": self.overlap_source}
+        return replace(self, **{**lengths, **shares, "sigma_rotation_deg": self.sigma_rotation_deg})
 
 
 @dataclass(frozen=True, eq=False, repr=False)  # arrays have no single truth value: compare what matters
@@ -107,7 +114,7 @@ class RegistrationResult:
     Attributes:
         T_target_source: (4, 4) float64, p_target = R p_source + t, in the files' own coordinates. Present
             whatever the status, except that a `failed` result without any hypothesis holds NaN: never
-            the identity as a stand-in.
+            the identity as a stand-in. Where the scale was estimated its linear part is ``scale`` times R.
         status: ok | low_confidence | ambiguous | failed.
         reasons: why the status is not ok, or what deserves attention; sentences.
         confidence: in [0, 1]; see docs/concepts.md for what it is made of.
@@ -119,6 +126,7 @@ class RegistrationResult:
             ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; ``scale_ratio``
             and ``scale_sigma``, see `geomoe3d.decision.scale.Scale`, where enough surface is shared; empty
             where nothing was estimated.
+        scale: p_target = scale R p_source + t; 1 unless it was estimated. Lengths of a result are the target's.
         accuracy: how closely the clouds lie on each other and how far off the transform may be; None where too
             little lies on each other to say, and in results of earlier versions.
         num_correspondences: correspondences given to the estimator.
@@ -158,6 +166,7 @@ class RegistrationResult:
     versions: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
     accuracy: Accuracy | None = None
+    scale: float = 1.0
 
     _inputs: ClassVar[Inputs | None] = None  # no field: it is neither compared nor part of the JSON
 
@@ -223,8 +232,9 @@ class RegistrationResult:
 
         if transform_format(path)[0] != "json":
             self._transform()
+        times = "" if self.scale == 1.0 else f"{self.scale:.9g} "
         comments = [
-            f"maps {self.source.name} into {self.target.name}: p_target = R p_source + t",
+            f"maps {self.source.name} into {self.target.name}: p_target = {times}R p_source + t",
             f"status {self.status}, confidence {self.confidence:.4f}",
         ]
         save_result(path, self, comments, force=force)
@@ -262,7 +272,8 @@ class RegistrationResult:
         for what, cloud in (("source", data), *([("target", other)] if distances else [])):
             if cloud is None:
                 raise InputError(NOT_KEPT.format(what=f"the {what}"))
-        return save_aligned(path, data, self._transform(), target=other if distances else None, force=force)
+        aside: dict[str, Any] = {"target": other if distances else None, "scale": self.scale}
+        return save_aligned(path, data, self._transform(), **aside, force=force)
 
     def picture(
         self,
@@ -344,18 +355,28 @@ class RegistrationResult:
         names = f"'{self.source.name}' into '{self.target.name}'"
         if not self.has_transform:
             return "; ".join([f"{words}: no transform that maps {names} was found", *self.reasons])
-        from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, transform_points
+        from geomoe3d.geometry.se3 import inverse, transform_points
 
-        words += f": maps {names}, turned by {rotation_angle_deg(self.T_target_source[:3, :3]):.1f} degrees"
+        words += f": maps {names}, turned by {self._turn():.1f} degrees"
+        if self.scale != 1.0:
+            words += f", scaled by {self.scale:.6g}"
         center = self.information_center[None]
         if np.isfinite(center).all():
-            step = np.linalg.norm(center - transform_points(inverse(self.T_target_source), center))
+            step = np.linalg.norm(
+                center - transform_points(inverse(self.T_target_source, self.scale), center)
+            )
             words += f" and shifted by {step:.3g}"
         words += (
             f"; {self.overlap:.0%} of the source lies on the target, {self.num_inliers:,} of "
             f"{self.num_correspondences:,} correspondences agree within {self.inlier_threshold:.3g}"
         )
         return "; ".join([words, *self.reasons])
+
+    def _turn(self) -> float:
+        """Angle of the rotation in degrees."""
+        from geomoe3d.geometry.se3 import rotation_angle_deg
+
+        return rotation_angle_deg(self.T_target_source[:3, :3] / self.scale)
 
     def _transform(self) -> FloatArray:
         if not self.has_transform:
@@ -390,13 +411,13 @@ class RegistrationResult:
 
         if not self.has_transform:
             return self._exchanged(replace(self, source=self.target, target=self.source))
-        T = inverse(self.T_target_source)
+        T = inverse(self.T_target_source, self.scale)
         # A left perturbation xi of T about c equals the perturbation -Ad(xi) of T^-1 about T^-1 c.
         A = np.zeros((6, 6))
-        A[:3, :3] = A[3:, 3:] = self.T_target_source[:3, :3]
+        A[:3, :3], A[3:, 3:] = self.T_target_source[:3, :3] / self.scale, self.T_target_source[:3, :3]
         other = self.alternative
         if other is not None:
-            other = replace(other, T_target_source=inverse(other.T_target_source))
+            other = replace(other, T_target_source=inverse(other.T_target_source, self.scale))
         evidence, overlap = dict(self.evidence), self.overlap
         if "overlap_target" in evidence:
             overlap = evidence["overlap_target"]
@@ -411,7 +432,10 @@ class RegistrationResult:
             alternative=other,
             information_matrix=A.T @ self.information_matrix @ A,
             information_center=transform_points(T, self.information_center[None])[0],
-            accuracy=None if self.accuracy is None else self.accuracy.exchanged(),
+            accuracy=None if self.accuracy is None else self.accuracy.exchanged(self.scale),
+            scale=1 / self.scale,
+            inlier_threshold=self.inlier_threshold / self.scale,
+            voxel_size=self.voxel_size / self.scale,
             source=self.target,
             target=self.source,
         )

@@ -29,7 +29,7 @@ class PointCloud:
         normals: (N, 3) unit normals or None.
         colors: (N, 3) in [0, 1] or None.
         name: what to call the cloud in messages.
-        num_non_finite: rows dropped because a coordinate was NaN or infinite.
+        num_non_finite: rows dropped because a coordinate was NaN or infinite, or stands for a missing measurement.
         notes: sentences on what of the file was not taken as it stands.
         sensor: (3,) where the file says that its one sensor stood, file coordinates, or None.
     """

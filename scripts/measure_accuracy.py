@@ -5,7 +5,7 @@
 FOLDER: posed fragments (generated rooms: bent as those of a depth camera are). Without one, every n-th pair of both
 benchmarks, whose published poses err themselves by centimetres. --sample: rigid pairs of the sample room, seeds 0 to
 n - 1, whose truth is exact. Prints, of right answers, the share of true errors below one and two deviations with
-Wilson's intervals: at the centre of the overlap, at the farthest source point, of the rotation.
+Wilson's intervals: at the centre of the overlap, at the farthest point, of the rotation.
 """
 
 from __future__ import annotations
@@ -44,13 +44,16 @@ def recorded(every: int) -> Iterator[tuple[Any, Any, FloatArray]]:
             yield load_points(pair.source), load_points(pair.target), pair.T_target_source
 
 
-def errors_over_deviations(result: RegistrationResult, source: FloatArray, truth: FloatArray) -> Row | None:
+def errors_over_deviations(
+    result: RegistrationResult, source: FloatArray, target: FloatArray, truth: FloatArray
+) -> Row | None:
     """True error over one deviation, or None where the answer is wrong or says nothing."""
     found, T = result.accuracy, result.T_target_source
     if found is None or not is_right(*motion_errors(T, truth)):
         return None
     moved, right, center = result.apply(source), truth @ inverse(T), result.information_center[None]
-    farthest = moved[[np.argmax(np.sum((moved - center) ** 2, axis=1))]]
+    places = np.vstack([moved, target])
+    farthest = places[[np.argmax(np.sum((places - center) ** 2, axis=1))]]
     at_center, at_farthest = (
         float(np.linalg.norm(transform_points(right, p) - p)) for p in (center, farthest)
     )
@@ -91,7 +94,8 @@ def main() -> None:
     for name, pairs in lots.items():
         rows, count = [], 0
         for source, target, truth in pairs:
-            row = errors_over_deviations(registrar.register(source, target), source.file_points, truth)
+            clouds = source.file_points, target.file_points
+            row = errors_over_deviations(registrar.register(source, target), *clouds, truth)
             rows += [] if row is None else [row]
             count += 1
         if rows:

@@ -215,6 +215,7 @@ def grids_seen(monkeypatch):
         return found
 
     monkeypatch.setattr(Pipeline, "match", spy)
+    monkeypatch.setattr(Registrar, "_mirrored", lambda *_: None)  # asks a pair of its own
     return seen
 
 

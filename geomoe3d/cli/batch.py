@@ -9,7 +9,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import configuration_options, worker_options
+from geomoe3d.cli.parts import configuration_options, scale_option, worker_options
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
@@ -24,6 +24,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.argument("out", metavar="OUT")
 @worker_options
 @configuration_options
+@scale_option
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
 @click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
 @click.option(

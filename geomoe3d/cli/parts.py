@@ -40,6 +40,16 @@ def worker_options(command: Command) -> Command:
     return result
 
 
+def scale_option(command: Command) -> Command:
+    """Adds ``--estimate-scale``, for verbs with `configuration_options`."""
+    result: Command = click.option(
+        "--estimate-scale",
+        is_flag=True,
+        help="The ratio of the clouds' lengths is unknown (1/1000 to 1000): estimate it too.",
+    )(command)
+    return result
+
+
 def configuration_options(command: Command) -> Command:
     """Adds the options; the command gets what they come to as ``config``, a `RegistrationConfig`.
 
@@ -56,6 +66,7 @@ def configuration_options(command: Command) -> Command:
         scorers = named.pop("part_scorers")
         _check([(option, value) for option, _, value in given] + [("scorer", name) for name in scorers])
         settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
+        settings.append(("scale", "estimate" if named.pop("estimate_scale", False) else None))
         settings += [(key, value) for _, key, value in given]
         chosen = [f"{key}={value}" for key, value in settings if value is not None]
         if scorers:

@@ -12,7 +12,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import configuration_options
+from geomoe3d.cli.parts import configuration_options, scale_option
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
@@ -38,6 +38,7 @@ class _Outputs:
 @click.argument("source", metavar="SOURCE")
 @click.argument("target", metavar="TARGET")
 @configuration_options
+@scale_option
 @click.option("--weights", metavar="FILE", help="Trained network (.safetensors): scorer or filter, as it is.")
 @click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
@@ -103,13 +104,15 @@ def command(
 ) -> None:
     """Find the rigid motion that lays SOURCE on TARGET: p_target = R p_source + t.
 
+    With --estimate-scale a similarity: p_target = scale R p_source + t.
+
     SOURCE and TARGET are point clouds or meshes (PLY, PCD, XYZ, NPY, OBJ, STL, LAS, E57, ...). No first
     guess is needed. The motion is given in the files' own coordinates, with a status: ok,
     low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
     """
 
     outputs = _Outputs(output, aligned, aligned_precision, distances, picture, page, report, unit)
-    _check_outputs(outputs, (source, target), force)
+    _check_outputs(outputs, (source, target), None if config.scale == "estimate" else 1.0, force)
     if show:
         from geomoe3d.visual.window import check_display
 
@@ -163,10 +166,13 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
         click.echo(summary(answer, inverted, unit), color=color)
 
 
-def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> None:
-    """Every output path is refused before the work begins, if it has to be refused at all."""
+def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], scale: float | None, force: bool) -> None:
+    """Every output path is refused before the work begins, if it has to be refused at all.
+
+    ``scale``: of the transform, None where it will be estimated.
+    """
     from geomoe3d.clouds.io import check_aligned
-    from geomoe3d.clouds.transform_files import check_suffix, transform_format
+    from geomoe3d.clouds.transform_files import check_scale_format, check_suffix, transform_format
     from geomoe3d.errors import OutputError
     from geomoe3d.runtime.files import check_output
     from geomoe3d.visual.picture import FORMATS
@@ -178,6 +184,8 @@ def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], force: bool) -> N
         ("--page", outputs.page, (".html", ".htm")),
         ("--report", outputs.report, (".pdf",)),
     )
+    for name in outputs.transforms:
+        check_scale_format(*transform_format(name), scale)
     taken = {Path(path).resolve(): "an input" for path in inputs}
     for option, path, suffixes in wanted:
         if path is None:
@@ -232,6 +240,7 @@ def _write(
                 result.T_target_source,
                 precision=outputs.precision,
                 target=inputs[1] if outputs.distances else None,
+                scale=result.scale,
                 force=force,
                 remark=lambda sentence: click.echo(f"note: {sentence}", err=True),
             )

@@ -52,9 +52,10 @@ def summary(result: RegistrationResult, inverted: bool = False, unit: str = "") 
 def direction(result: RegistrationResult, inverted: bool = False) -> str:
     """Which way the transform maps, in one sentence with the names of the clouds."""
     first, second = Path(result.source.name).name, Path(result.target.name).name
+    times = "" if result.scale == 1.0 else f"{result.scale:.9g} "
     if inverted:
-        return f"maps TARGET ({first}) into SOURCE ({second}): p_source = R p_target + t"
-    return f"maps SOURCE ({first}) into TARGET ({second}): p_target = R p_source + t"
+        return f"maps TARGET ({first}) into SOURCE ({second}): p_source = {times}R p_target + t"
+    return f"maps SOURCE ({first}) into TARGET ({second}): p_target = {times}R p_source + t"
 
 
 def matrix_text(T: FloatArray) -> str:

@@ -276,6 +276,28 @@ def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
     return raw, num_non_finite
 
 
+def without_missing(cloud: PointCloud) -> PointCloud:
+    """A cloud without its points at exactly (0, 0, 0) in the file, where there is more than one and others are left.
+
+    They stand for missing measurements, are counted with the non-finite points and named in the notes; one such
+    point may be a point.
+    """
+    missing = (cloud.points == -cloud.origin).all(axis=1)
+    count = int(np.count_nonzero(missing))
+    if count < 2 or count == len(cloud):
+        return cloud
+    kept = ~missing
+    note = f"'{cloud.name}': {count:,} points at exactly (0, 0, 0) stand for missing measurements and were left out"
+    return replace(
+        cloud,
+        points=cloud.points[kept],
+        normals=None if cloud.normals is None else cloud.normals[kept],
+        colors=None if cloud.colors is None else cloud.colors[kept],
+        num_non_finite=cloud.num_non_finite + count,
+        notes=(*cloud.notes, note),
+    )
+
+
 def _unit(normals: FloatArray) -> FloatArray | None:
     """Normals of length 1, or None if one has no direction."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""A rigid motion applied to whatever holds points in memory; what comes back is of the same kind.
+"""A rigid motion or a similarity applied to whatever holds points in memory; what comes back is of the same kind.
 
 Libraries are recognised by the module of the object's type, so none of them is imported for an array. Nothing is
 changed in place. Cost: one pass over the points, in float64.
@@ -15,17 +15,17 @@ import numpy as np
 from geomoe3d.clouds.formats.objects import library_of
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.errors import InputError
-from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.geometry.se3 import scale_of, transform_points
 from geomoe3d.types import FloatArray, PointCloud
 
 
 def moved(data: Any, T: FloatArray) -> Any:
-    """Points (N, 3) in file coordinates, moved: p -> R p + t.
+    """Points (N, 3) in file coordinates, moved: p -> R p + t, R with its scale.
 
     Args:
         data: an array or what makes one; a torch tensor; an Open3D cloud or mesh, legacy or tensor; a trimesh
             cloud, mesh or scene; or a `PointCloud`.
-        T: (4, 4) rigid.
+        T: (4, 4) rigid motion or similarity.
 
     Returns:
         A float64 array for arrays. A tensor on the same device, of the same type where it is a float, through
@@ -37,7 +37,7 @@ def moved(data: Any, T: FloatArray) -> Any:
     if isinstance(data, PointCloud):
         points = transform_points(T, data.file_points)
         origin, normals = choose_origin(points), data.normals
-        turned = None if normals is None else normals @ T[:3, :3].T
+        turned = None if normals is None else normals @ (T[:3, :3] / scale_of(T)).T
         sensor = None if data.sensor is None else transform_points(T, data.sensor[None])[0]
         return replace(data, points=points - origin, origin=origin, normals=turned, sensor=sensor)
     library = library_of(data)
@@ -76,12 +76,15 @@ def _moved_tensor(tensor: Any, T: FloatArray) -> Any:
 
 
 def _moved_open3d(data: Any, T: FloatArray) -> Any:
+    scaled = scale_of(T) != 1.0  # normals of length 1 get the scale too
     if not hasattr(data, "clone"):  # legacy: float64 throughout
-        return type(data)(data).transform(T)
+        turned = type(data)(data).transform(T)
+        return turned.normalize_normals() if scaled else turned
     import open3d
 
     host = open3d.core.Device("CPU:0")
     copy = data.clone().transform(open3d.core.Tensor(T, open3d.core.float64, host))
+    copy = copy.normalize_normals() if scaled else copy
     part = "point" if hasattr(data, "point") else "vertex"
     before = getattr(data, part)["positions"]
     exact = transform_points(T, before.cpu().numpy().astype(np.float64))  # float32 loses what lies far away

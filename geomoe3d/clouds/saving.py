@@ -25,6 +25,7 @@ from geomoe3d.clouds.loading import describe, finite_part, is_sampled, load_poin
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.clouds.vectors import turned
 from geomoe3d.errors import FormatError, InputError, NonFiniteError
+from geomoe3d.geometry.se3 import scale_of
 from geomoe3d.runtime.files import check_output, write_atomically
 from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import FloatArray
@@ -169,6 +170,7 @@ def save_aligned(
     *,
     precision: str = "auto",
     target: Any = None,
+    scale: float = 1.0,
     force: bool = False,
     remark: Callable[[str], None] = lambda sentence: None,
 ) -> tuple[str, ...]:
@@ -186,13 +188,14 @@ def save_aligned(
     Args:
         path: a suffix of `save_points`, or for meshes .obj, .off, .stl or .glb.
         source: anything `load_points` takes.
-        T_target_source: (4, 4) rigid motion in file coordinates.
+        T_target_source: (4, 4) in file coordinates: a rigid motion, or a similarity with the given scale.
         precision: of coordinates in PLY and PCD. "auto" writes floats, which every program reads, where they
             move nothing by more than 1e-6 of the spread, and all digits elsewhere; "double" always writes all
             digits; "single" always writes floats, of coordinates far from zero minus an origin, which is
             stated in the header.
         target: anything `load_points` takes: each point gets a field ``distance`` to the nearest point of it at
             full resolution (NaN where (0, 0, 0) marks a missing measurement); None writes no such field.
+        scale: of the similarity, 1 for a rigid motion; lengths of directions such as velocities are kept.
         force: replace an existing file, which may be the source itself.
         remark: called with sentences on how the file can be read.
 
@@ -205,7 +208,9 @@ def save_aligned(
         OutputError: as `check_cloud_output`, or the disk refuses.
     """
     with np.errstate(all="ignore"):  # normals and fields may be any numbers
-        return _save_aligned(path, source, _rigid(T_target_source), precision, target, force, remark)
+        return _save_aligned(
+            path, source, _checked_motion(T_target_source, scale), precision, target, force, remark
+        )
 
 
 def _save_aligned(
@@ -291,8 +296,9 @@ def _moved(raw: RawCloud, T: FloatArray) -> tuple[RawCloud, tuple[str, ...]]:
     at_zero = ~raw.points.any(axis=1)
     if raw.faces is None and np.count_nonzero(at_zero) > 1:
         points[at_zero] = 0.0
-    fields, stayed = turned(raw.fields, T[:3, :3])
-    normals = None if raw.normals is None else raw.normals @ T[:3, :3].T
+    R = T[:3, :3] / scale_of(T)
+    fields, stayed = turned(raw.fields, R)
+    normals = None if raw.normals is None else raw.normals @ R.T
     return replace(raw, points=points, normals=normals, fields=fields), stayed
 
 
@@ -310,7 +316,7 @@ def _distances(points: FloatArray, target: Any) -> NDArray[np.float32]:
     return distances
 
 
-def _rigid(T: ArrayLike) -> FloatArray:
+def _checked_motion(T: ArrayLike, scale: float) -> FloatArray:
     try:
         matrix = np.asarray(T, dtype=np.float64)
     except (TypeError, ValueError):
@@ -319,11 +325,15 @@ def _rigid(T: ArrayLike) -> FloatArray:
         raise InputError(f"T_target_source has shape {matrix.shape}, expected (4, 4)")
     if not np.isfinite(matrix).all():
         raise InputError("T_target_source holds NaN or infinities: there is no transform to apply")
-    error = float(np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max())
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"the scale of a similarity is positive, found {scale}")
+    R = matrix[:3, :3] / scale
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
     bottom = np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max()
-    if error > 1e-4 or bottom > 1e-9 or np.linalg.det(matrix[:3, :3]) < 0:
+    if error > 1e-4 or bottom > 1e-9 or np.linalg.det(R) < 0:
+        what = "rigid motion" if scale == 1.0 else f"similarity of scale {scale:.6g}"
         raise InputError(
-            f"T_target_source is no rigid motion: |R R^T - I| is {error:.3g} (limit 1e-4), the determinant "
-            f"{np.linalg.det(matrix[:3, :3]):.3g} (expected 1), the last row {matrix[3].tolist()}"
+            f"T_target_source is no {what}: |R R^T - I| is {error:.3g} (limit 1e-4), the determinant "
+            f"{np.linalg.det(R):.3g} (expected 1), the last row {matrix[3].tolist()}"
         )
     return matrix

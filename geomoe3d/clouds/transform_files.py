@@ -16,8 +16,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geomoe3d.clouds.transform_formats import TEXTS, describe_error, matrix_text, of_matrix, parse_transform
+from geomoe3d.clouds.transform_formats import (
+    TEXTS,
+    WITHOUT_SCALE,
+    describe_error,
+    matrix_text,
+    of_matrix,
+    parse_transform,
+)
 from geomoe3d.errors import FormatError, InputError, cannot_read
+from geomoe3d.geometry.se3 import scale_of
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.types import FloatArray
 
@@ -74,14 +82,14 @@ def save_transform(
 
     Args:
         path: the file, with or without the name of a format.
-        T: p_target = R p_source + t.
+        T: p_target = R p_source + t, R with its scale.
         comments: lines that say which way it maps, where the format has room for them.
         frames: what T maps into, and what it maps, in formats that name frames.
         force: replace an existing file.
 
     Raises:
         InputError: the matrix is not (4, 4) or not finite.
-        FormatError: no such format, or "json", which is a whole result's.
+        FormatError: no such format, "json", which is a whole result's, or one that cannot hold the scale of T.
         OutputError: as `geomoe3d.runtime.files.write_atomically`.
     """
     kind, path = transform_format(path)
@@ -90,6 +98,7 @@ def save_transform(
         raise InputError(f"'{path}' not written: expected a finite (4, 4) matrix, found {T.tolist()}")
     if kind == "json":
         raise FormatError(f"cannot write '{path}': JSON holds whole results; use .txt or .npy for a matrix")
+    check_scale_format(kind, path, scale_of(T))
     if kind in TEXTS:
         write_text(path, TEXTS[kind](T, comments, frames), force=force)
         return
@@ -99,6 +108,26 @@ def save_transform(
             np.save(stream, T)
 
     write_atomically(path, write, force=force)
+
+
+def check_scale_format(kind: str, path: Path, scale: float | None) -> None:
+    """Refuse a format that holds a rotation and a translation where there is a scale.
+
+    Args:
+        kind: of `transform_format`.
+        path: named in the message.
+        scale: of the similarity, or None where it is still to be estimated.
+
+    Raises:
+        FormatError: the format cannot hold it.
+    """
+    if scale != 1.0 and kind in WITHOUT_SCALE:
+        said = "an estimated scale" if scale is None else f"a scale of {scale:.6g}"
+        others = [name for name in TRANSFORM_FORMATS if name not in WITHOUT_SCALE]
+        raise FormatError(
+            f"cannot write '{path}': '{kind}' holds a rotation and a translation, not {said}; use one of "
+            f"{', '.join(others)}"
+        )
 
 
 def save_result(

@@ -84,6 +84,9 @@ def _yaml_float(text: str) -> str:
     return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}"
 
 
+WITHOUT_SCALE = ("quaternion", "tum", "kitti", "ros", "tf")
+"""Formats of a rotation and a translation, which cannot hold a similarity."""
+
 TEXTS: dict[str, Callable[[FloatArray, Sequence[str], tuple[str, str]], str]] = {
     "matrix": matrix_text,
     "cloudcompare": matrix_text,

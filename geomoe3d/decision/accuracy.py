@@ -54,9 +54,9 @@ def measure_accuracy(
     distances = np.abs(contact.gaps)
     agreeing = residuals(T_target_source, matched.source, matched.target)
     agreeing = agreeing[agreeing < threshold]
-    moved = transform_points(T_target_source, source.points)
+    places = np.vstack([transform_points(T_target_source, source.points), target.points])
     center = contact.points.mean(0)
-    farthest = moved[np.argmax(np.sum((moved - center) ** 2, axis=1))]
+    farthest = places[np.argmax(np.sum((places - center) ** 2, axis=1))]
     radius, covariance = _covariance(contact, center, source.voxel_size)
     J = np.hstack([-cross_matrix((farthest - center) / radius), np.eye(3)])
     variances = np.trace(covariance[3:, 3:]), np.trace(J @ covariance @ J.T), np.trace(covariance[:3, :3])

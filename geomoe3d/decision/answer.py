@@ -81,11 +81,15 @@ class Decision:
         was = self.judgement
         if scale is None or not scale.differs or was.confidence < _BELIEVED:
             return replace(self, scale=scale)
+        said = (scale.exchanged() if exchanged else scale).sentence()
+        return replace(self, scale=scale).doubted(said)
+
+    def doubted(self, reason: str) -> Decision:
+        """The same decision, never ok, for a reason that is said first."""
+        was = self.judgement
         status: Status = "low_confidence" if was.status == "ok" else was.status
         confidence = min(was.confidence, _WRONG_SCALE_CONFIDENCE)
-        said = (scale.exchanged() if exchanged else scale).sentence()
-        judgement = Judgement(status, (said, *was.reasons), confidence)
-        return replace(self, scale=scale, judgement=judgement)
+        return replace(self, judgement=Judgement(status, (reason, *was.reasons), confidence))
 
     def residuals(self, matched: Correspondences) -> FloatArray:
         """|R p + t - q| of every correspondence (N,); infinite without a transform."""

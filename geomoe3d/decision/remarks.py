@@ -9,11 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.clouds.prepare import choose_voxel_size
 from geomoe3d.config import PreparationConfig
 from geomoe3d.decision.confidence import Judgement
-from geomoe3d.types import PreparedCloud
+from geomoe3d.types import PointCloud, PreparedCloud
 
 _FLAT = 1e-6  # thickness over extent of what has no surface in space
+_NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 99999.0)  # what programs write for no measurement
+_LEAST_NO_DATA = 3
+_UNUSUAL = 3.0  # times the voxel size that would be chosen
 _FEW_VOXELS = 100  # far below what the chosen grid aims at
 
 
@@ -63,6 +67,36 @@ def remarks(
             "where the sensors stood is not known and was guessed; if they stood at the files' origins, "
             "preparation.viewpoint=origin says so, and more answers are right"
         )
+
+
+def data_remarks(
+    clouds: tuple[PointCloud, PointCloud], wanted: float, config: PreparationConfig
+) -> Iterator[str]:
+    """Causes, in the clouds as loaded, of an answer that is not ok; arguments as `remarks`.
+
+    Numbers that are no measurements, and a voxel size far from the one that would be chosen.
+    """
+    for loaded in clouds:
+        yield from _no_data(loaded)
+    usual = choose_voxel_size(*clouds, config.voxel_points)
+    if not 1 / _UNUSUAL < wanted / usual < _UNUSUAL:
+        size = "large" if wanted > usual else "small"
+        yield (
+            f"the voxel size {wanted:.4g} is {size} for these clouds: without one given {usual:.4g} would be taken"
+        )
+
+
+def _no_data(cloud: PointCloud) -> Iterator[str]:
+    """A sentence on each axis with numbers that stand for no measurement, at least three and beside others."""
+    for axis, name in enumerate("xyz"):
+        values = cloud.points[:, axis] + cloud.origin[axis]
+        for number in _NO_DATA:
+            count = int(np.count_nonzero(values == number))
+            if _LEAST_NO_DATA <= count < len(values):
+                yield (
+                    f"'{cloud.name}': {count:,} points have the {name} {number:.0f}, which stands for no measurement "
+                    "in many programs; remove them"
+                )
 
 
 def _is_one_file(given: tuple[Any, Any]) -> bool:

@@ -27,6 +27,7 @@ _PER_DISTORTION, _PER_FORMAL = 0.8, 4.5
 # as many deviations do.
 _SIGNIFICANT, _TOLERATED, _UNHEARD_OF, _FIRM = 2.6, 0.01, 0.06, 0.05
 
+DIFFERS = "the scale differs"
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "metres": 1.0}
 _UNIT_TOLERANCE = 0.02
 _EXTENT_TOLERANCE = 1.5  # twice applied, it never leads from one unit to the next
@@ -59,7 +60,7 @@ class Scale:
     def sentence(self) -> str:
         """What a user is told where it `differs`."""
         text = (
-            f"the scale differs: lengths of the source are {self.ratio:.4g} times those of the target "
+            f"{DIFFERS}: lengths of the source are {self.ratio:.4g} times those of the target "
             f"(+- {100 * self.sigma:.1f} %), and a rigid motion cannot change scale"
         )
         return text + seeming_units(self.ratio)

@@ -29,10 +29,16 @@ def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
     return moved
 
 
-def inverse(T: FloatArray) -> FloatArray:
-    """Inverse of a rigid motion (4, 4), using R^-1 = R^T."""
-    R = T[:3, :3]
-    return make_transform(R.T, -R.T @ T[:3, 3])
+def inverse(T: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Inverse of a rigid motion (4, 4), using R^-1 = R^T, or of a similarity with the given scale."""
+    R = T[:3, :3] / scale
+    return make_transform(R.T / scale, -R.T @ T[:3, 3] / scale)
+
+
+def scale_of(T: FloatArray) -> float:
+    """The scale of a similarity (4, 4); exactly 1 where it is within 1e-9 of it, as of a rigid motion."""
+    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    return 1.0 if abs(scale - 1.0) < 1e-9 else scale
 
 
 def residuals(T: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from geomoe3d.batch.store import BatchStore
 from geomoe3d.batch.task import Settings
 from geomoe3d.clouds.formats.e57 import require_pye57
 from geomoe3d.config import RegistrationConfig, build_config
-from geomoe3d.errors import InputError
+from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.multiway.assembly import Assembly
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
 from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
@@ -114,6 +114,8 @@ def register_scans(
     check_folder(folder, paths, page=page)
     say = say or (lambda text: None)
     clock = StageClock(say)
+    if config is not None and config.scale != "fixed":
+        raise ConfigError(f"scale: {config.scale} is for pairs; bring all scans of one model to one unit")
     found = find_scans(paths)
     stored = None if fresh else _stored_voxel_size(folder / "pairs")
     clock("look at the scans")
@@ -195,7 +197,8 @@ def _with_voxel_size(
 
 def _looked_at_once(config: RegistrationConfig) -> RegistrationConfig:
     """The configuration without second looks at doubtful pairs."""
-    look = {**config.second_look.model_dump(), "descriptor": "none", "grids": (), "max_correspondences": 0}
+    alone = {"descriptor": "none", "grids": (), "max_correspondences": 0, "mirror": False}
+    look = {**config.second_look.model_dump(), **alone}
     return build_config(RegistrationConfig, {**config.model_dump(), "second_look": look})
 
 

@@ -29,9 +29,11 @@
   };
 
   /* ---------- rigid motion ---------- */
-  // Row-major 4x4 -> [unit quaternion w x y z, translation].
+  // Row-major 4x4 -> [unit quaternion w x y z, translation, scale].
   function parts(m) {
-    const [a, b, c, , d, e, f, , g, h, i] = m;
+    const rows = [[m[0], m[1], m[2]], [m[4], m[5], m[6]], [m[8], m[9], m[10]]];
+    const scale = Math.cbrt(rows.reduce((product, row) => product * Math.hypot(...row), 1));
+    const [a, b, c, d, e, f, g, h, i] = rows.flat().map((v) => v / scale);
     const t = [m[3], m[7], m[11]];
     const squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i];
     const largest = squares.indexOf(Math.max(...squares)); // the best conditioned of the four formulas
@@ -43,7 +45,7 @@
       [(d - b) / s, (c + g) / s, (f + h) / s, s / 4],
     ][largest];
     const length = Math.hypot(...q);
-    return [q.map((v) => v / length), t];
+    return [q.map((v) => v / length), t, scale];
   }
   function slerp(p, q, s) {
     let cosine = p.reduce((sum, v, i) => sum + v * q[i], 0);
@@ -53,22 +55,24 @@
     const r = p.map((v, i) => wp * v + wq * q[i]), length = Math.hypot(...r);
     return r.map((v) => v / length);
   }
-  // Column-major 4x4 of a quaternion and a translation.
-  function compose([w, x, y, z], t) {
-    return Float64Array.of(
+  // Column-major 4x4 of a quaternion, a translation and a scale.
+  function compose([w, x, y, z], t, scale) {
+    const m = Float64Array.of(
       1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y), 0,
       2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x), 0,
       2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y), 0,
       t[0], t[1], t[2], 1);
+    for (const k of [0, 1, 2, 4, 5, 6, 8, 9, 10]) m[k] *= scale;
+    return m;
   }
   /* The source is centred on itself, so it turns about its own middle while that moves on a straight line:
-     a rigid motion at every instant, never a shrinking blend of two matrices. */
+     a rigid motion at every instant, never a shrinking blend of two matrices. An estimated scale grows along. */
   function sourceModel() {
-    const [q0, t0] = parts(data.motions.before);
-    if (!data.motions[state.motion]) return compose(q0, t0);
-    const [q1, t1] = parts(data.motions[state.motion]);
+    const [q0, t0, scale0] = parts(data.motions.before);
+    if (!data.motions[state.motion]) return compose(q0, t0, scale0);
+    const [q1, t1, scale1] = parts(data.motions[state.motion]);
     const s = state.progress;
-    return compose(slerp(q0, q1, s), t0.map((v, i) => (1 - s) * v + s * t1[i]));
+    return compose(slerp(q0, q1, s), t0.map((v, i) => (1 - s) * v + s * t1[i]), scale0 ** (1 - s) * scale1 ** s);
   }
 
   /* ---------- camera and canvas ---------- */

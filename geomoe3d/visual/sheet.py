@@ -108,7 +108,9 @@ def draw_sheet(view: RegistrationView) -> Figure:
         y -= panel
     y = _heading(figure, y - 0.02, "Transform")
     if view.has_transform:
-        y = _paragraph(figure, y, "p_target = R p_source + t, in the files' own coordinates; rows of [R t]:")
+        s, times = ("", "") if result.scale == 1.0 else ("s", f"{result.scale:.6g} ")
+        said = f"p_target = {times}R p_source + t, in the files' own coordinates; rows of [{s}R t]:"
+        y = _paragraph(figure, y, said)
         for row in result.T_target_source[:3]:
             cells = [*(f"{value: .9f}" for value in row[:3]), f"{row[3]: .6f}"]
             figure.text(

@@ -24,7 +24,7 @@ from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.clouds.formats.text import write_rows
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError
-from geomoe3d.geometry.se3 import make_transform, transform_points
+from geomoe3d.geometry.se3 import make_transform, scale_of, transform_points
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 
@@ -272,7 +272,7 @@ def moved_obj(path: Path, T: FloatArray, to: Path) -> bytes:
 
     Args:
         path: the file.
-        T: p_target = R p_source + t.
+        T: p_target = R p_source + t, R with its scale.
         to: where it will be written; the names of material files are made relative to that.
 
     Raises:
@@ -288,7 +288,7 @@ def moved_obj(path: Path, T: FloatArray, to: Path) -> bytes:
             raise FormatError(f"'{path}': a line that begins with '{word}' is not three numbers") from None
         if not len(values):
             continue
-        moved = move_points(values, T) if word == "v" else values @ T[:3, :3].T
+        moved = move_points(values, T) if word == "v" else values @ (T[:3, :3] / scale_of(T)).T
         for k, row, rest in zip(rows, moved.tolist(), words, strict=True):
             lines[k] = " ".join([word, *map(repr, row), *rest[4:]])
     for k, line in enumerate(lines):

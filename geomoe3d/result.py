@@ -80,7 +80,7 @@ class Accuracy:
         distance_mean, distance_median, distance_std, distance_p95: mean, median, standard deviation and 95 %
             quantile of the distances.
         sigma_center: deviation of where the transform puts the centre of the overlap.
-        sigma_farthest: deviation of where it puts the place of the point, of either cloud, farthest from that centre.
+        sigma_farthest: the same at the point of either cloud that is farthest from that centre.
         sigma_rotation_deg: deviation of its rotation, degrees.
     """
 

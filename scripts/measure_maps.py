@@ -1,14 +1,16 @@
-"""Scans in maps: one room, three rooms side by side, scans of another building; peers beside.
+"""Scans in maps: one room, three rooms side by side, scans of another building, a generated building; peers beside.
 
-    python scripts/measure_maps.py OUT [--cases room three stranger] [--methods geomoe3d kiss-matcher
+    python scripts/measure_maps.py OUT [--cases room three stranger building alike] [--methods geomoe3d kiss-matcher
         open3d-feature-ransac] [--every 1]
 
 The rooms are three dev scenes of 3DMatch, each merged by its published poses; 60 fragments are asked for, 20 of each.
 They are left out in five turns: a map holds none of the twelve fragments asked for in its turn. Side by side the rooms
 stand 12 m apart (34 m, 3 million points). Strangers are the fragments of a fourth scene, sought in the three rooms.
-Peers register the same clouds on the grid of geomoe3d. Right: within 15 degrees and 30 cm. One line per query goes to
-OUT/queries.jsonl; what is there is not done again; `--every N` asks for every Nth query. The map's time is that of
-`Map.from_cloud`, once per turn; a query's is that of `Map.locate`.
+The building holds 40 generated rooms in a raster, no two alike, or (`alike`) ten of them the same room; each is
+scanned from three places by a laser on a tripod. Every second room, or each of those that are alike, is asked for by a
+depth camera that turns by 60 degrees. Peers register the same clouds on the grid of geomoe3d. Right: within 15 degrees
+and 30 cm. One line per query goes to OUT/queries.jsonl; what is there is not done again; `--every N` asks for every Nth
+query. The map's time is that of `Map.from_cloud`, once per turn; a query's is that of `Map.locate`.
 """
 
 from __future__ import annotations
@@ -18,13 +20,17 @@ import statistics
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geomoe3d.clouds.io import load_points
+from geomoe3d.data.rooms.scanner import TRIPOD, LaserScanner, stand_scanner
+from geomoe3d.data.rooms.scenes import Scene, generate_scene
+from geomoe3d.data.rooms.sensor import KINECT, cast
+from geomoe3d.data.rooms.walk import camera_pose
 from geomoe3d.data.threedmatch import BENCHMARKS, find_benchmark_root, load_benchmark
 from geomoe3d.evaluation.intervals import wilson
 from geomoe3d.evaluation.metrics import is_right, motion_errors
@@ -37,7 +43,9 @@ from geomoe3d.types import FloatArray
 
 OURS = "geomoe3d"
 METHODS = (OURS, "kiss-matcher", "open3d-feature-ransac")
-CASES = ("room", "three", "stranger")
+CASES = ("room", "three", "stranger", "building", "alike")
+ROOMS, ALIKE, SPACE = 40, 10, 9.0
+_TRIPOD = TRIPOD.model_copy(update={"rings": 150, "azimuth_step_deg": 1.0})
 APART, PER_SCENE, TURNS = 12.0, 20, 5
 GRID = 0.055  # of the peers; geomoe3d describes these maps on it
 
@@ -118,6 +126,55 @@ def _poses(scene: str) -> dict[int, FloatArray]:
     return found
 
 
+class Building:
+    """Generated rooms in a raster; the first ten are one room where they are to be alike."""
+
+    def __init__(self, alike: bool) -> None:
+        self._seeds = [0 if alike and k < ALIKE else k for k in range(ROOMS)]
+        self.asked = list(range(ALIKE)) if alike else list(range(0, ROOMS, 2))
+        self._scenes = {seed: _one_room(seed) for seed in sorted(set(self._seeds))}
+
+    def _place(self, room: int) -> FloatArray:
+        return np.array([SPACE * (room % 8), SPACE * (room // 8), 0.0])
+
+    def cloud(self) -> FloatArray:
+        """(N, 3) of all rooms, each scanned anew."""
+        parts = []
+        for room, seed in enumerate(self._seeds):
+            rng, scene = np.random.default_rng((1, room)), self._scenes[seed]
+            for pose in stand_scanner(np.random.default_rng((2, seed)), scene, 3):
+                points = LaserScanner(_TRIPOD).scan(scene.rays, pose, rng)
+                parts.append(transform_points(pose, points) + self._place(room))
+        return np.concatenate(parts)
+
+    def view(self, room: int) -> tuple[FloatArray, FloatArray]:
+        """(N, 3) of a depth camera in one room, in its frame, and its pose T_map_camera."""
+        rng, scene = np.random.default_rng((3, room)), self._scenes[self._seeds[room]]
+        stand = stand_scanner(rng, scene, 1)[0]
+        yaw = rng.uniform(0, 360)
+        poses, parts = [], []
+        for turn in (-30.0, 0.0, 30.0):
+            poses.append(camera_pose(stand[:3, 3], yaw + turn, -15.0, 0.0))
+            hits = cast(scene.rays, KINECT, poses[-1])
+            depth = hits.depth.ravel()
+            seen = np.isfinite(depth) & (depth > 0.4) & (depth < 6.0) & (hits.slope.ravel() > 0.1)
+            noisy = depth[seen] + 0.0015 * depth[seen] ** 2 * rng.standard_normal(int(seen.sum()))
+            points = KINECT.rays()[seen] * noisy[:, None]
+            parts.append(transform_points(inverse(poses[0]) @ poses[-1], points))
+        pose = poses[0].copy()
+        pose[:3, 3] += self._place(room)
+        return np.concatenate(parts), pose
+
+
+def _one_room(seed: int) -> Scene:
+    """The first generated scene from a seed on that is a single room."""
+    for attempt in range(100):
+        scene = generate_scene(np.random.default_rng((seed, attempt)))
+        if len(scene.areas) == 1:
+            return scene
+    raise RuntimeError(f"no single room among a hundred of seed {seed}")
+
+
 def maps(scenes: Scenes, cases: list[str]) -> Iterator[tuple[str, int, list[str], list[Query]]]:
     """Case, turn, the rooms of the map, and the scans sought in it."""
     rooms = scenes.names[:3]
@@ -134,6 +191,9 @@ def maps(scenes: Scenes, cases: list[str]) -> Iterator[tuple[str, int, list[str]
             other = scenes.names[3]
             queries = [Query("stranger", other, n, turn, None) for n in scenes.numbers(other)[turn::TURNS]]
             yield "stranger", turn, rooms, queries
+    for case in ("building", "alike"):
+        if case in cases:
+            yield case, 0, [], [Query(case, "rooms", n, 0, None) for n in Building(case == "alike").asked]
 
 
 def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Map | None) -> dict[str, Any]:
@@ -141,7 +201,7 @@ def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Ma
     begin = time.perf_counter()
     line: dict[str, Any] = {}
     if made is not None:
-        found = made.locate(scan)
+        found = made.locate(scan, k=ALIKE)
         T: FloatArray | None = found.T_map_scan
         line = {"status": found.status, "confidence": found.result.confidence}
         places = [place.T_map_scan for place in found.places]
@@ -165,6 +225,7 @@ def report(lines: list[dict[str, Any]]) -> None:
         wrong = sum(not line.get("right", False) for line in sure)
         for name, number in (
             ("right", sum(line.get("right", False) for line in of) if case != "stranger" else None),
+            ("among ten", sum(line.get("among", False) for line in of) if case == "alike" else None),
             ("ok", len(sure) if method == OURS else None),
             ("wrong ok", wrong if method == OURS else None),
         ):
@@ -196,14 +257,19 @@ def main() -> None:
             open_ones = [(q, m) for q in chosen for m in options.methods if (q.key, m) not in done]
             if not open_ones:
                 continue
-            world = scenes.merged(rooms, turn)
+            building = Building(case == "alike") if case in ("building", "alike") else None
+            world = scenes.merged(rooms, turn) if building is None else building.cloud()
             made, indexed = None, 0.0
             if any(method == OURS for _, method in open_ones):
                 begin = time.perf_counter()
                 made = Map.from_cloud(world)
                 indexed = time.perf_counter() - begin
             for query, method in open_ones:
-                scan = scenes.points(query.scene, query.number)
+                if building is None:
+                    scan = scenes.points(query.scene, query.number)
+                else:
+                    scan, truth = building.view(query.number)
+                    query = replace(query, truth=truth)
                 line = ask(method, query, scan, world, made if method == OURS else None)
                 head = {"key": query.key, "case": case, "method": method}
                 if method == OURS:

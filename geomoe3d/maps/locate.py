@@ -31,7 +31,7 @@ from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, PreparedCloud
 
-_FIRST_WINDOWS, _WINDOWS, _MORE_WINDOWS = 6, 12, 40
+_FIRST_WINDOWS, _WINDOWS, _MORE_WINDOWS = 6, 12, 24
 _PLAIN = 0.65  # a quick score that hardly any wrong motion reaches: no more windows are looked into
 _KEPT, _POLISHED = 12, 8  # distinct candidates, and how many of them are drawn closer
 _POLISHING = (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)  # voxels within which points are matched, step by step
@@ -105,7 +105,7 @@ class Search:
         """Distinct motions into the map with their quick scores, best first.
 
         Args:
-            more: look into four times as many windows.
+            more: look into twice as many windows, and match all points.
             near: (3,) where the scan's sensor, or its middle where none is known, is said to be, local coordinates,
                 and how far off at most.
             given: further motions (4, 4), local coordinates.

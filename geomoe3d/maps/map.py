@@ -336,11 +336,16 @@ class Map:
         search = Search(self._pipeline, described, wide, level, self._part(level), clock)
         local = [shift_frames(T, -cloud.origin, -self._voxels.origin) for T in guesses]
         found: list[Found] = []
+        looked: list[Hypothesis] = []
+        known: list[FloatArray] = []
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for more, where in self._rounds(near):
-            candidates = search.candidates(more=more, near=where, given=local)
-            found += [search.look(h) for h in likely(candidates, count)]
+            candidates = search.candidates(more=more, near=where, given=[*local, *known])
+            known += [h.T_target_source for _, h in candidates]
+            fresh = [h for h in likely(candidates, count) if all(search.differ(h, old) for old in looked)]
+            looked += fresh
+            found += [search.look(h) for h in fresh]
             if found:
                 best, ranked = search.decide(found)
                 if best.decision.judgement.status == "ok":

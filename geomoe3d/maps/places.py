@@ -127,7 +127,7 @@ class Query:
             fine: match all points of both, not one per two voxels: five times as long, and more is found.
         """
         if fine:
-            near = self.level.tree.query_ball_point(window.center, 1.5 * self.radius, return_sorted=True)
+            near = self.level.tree.query_ball_point(window.center, 1.3 * self.radius, return_sorted=True)
             scan, there = self._all, self.level.sides(np.array(near, dtype=np.int64))
         else:
             first, keys = self.level.first, window.keys

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -169,12 +170,34 @@ def test_a_place_that_fits_at_a_wrong_scale_gives_way_to_a_better_one() -> None:
         evidence = {"score": 25.0 if place == 1.0 else 1.4, "scale_ratio": place / ratio, "scale_sigma": 0.01}
         settled = abs(np.log(place / ratio)) < 0.01
         found = make_result(np.eye(4), evidence=evidence, status="ok" if settled else "low_confidence")
-        return Explanation(replace(found, confidence=0.97 if settled else 0.5), cloud, cloud)
+        return Explanation(replace(found, confidence=0.99 if settled else 0.5), cloud, cloud)
 
     best = find_similarity(scaled_cloud(cloud, 1.18), cloud, attempt)
     assert best is not None and best[0].result.ok
     assert best[1] == pytest.approx(1.0)
     assert len(asked) < 10
+
+
+def test_the_more_scales_were_tried_the_less_one_that_fits_is_worth() -> None:
+    """0.96 at the fifteenth rung is no ok; 0.96 at the first one leaves odds of 24 to 2."""
+    cloud = PointCloud(np.random.default_rng(0).normal(size=(500, 3)))
+
+    def attempt_with(place: float, confidence: float) -> Callable[[float, bool], Explanation]:
+        def attempt(ratio: float, thorough: bool) -> Explanation:
+            near = abs(np.log(place / ratio)) < 0.05
+            evidence = {"score": 9.0 if near else 0.1, "scale_ratio": 1.0, "scale_sigma": 0.01}
+            found = make_result(np.eye(4), evidence=evidence, status="ok" if near else "low_confidence")
+            return Explanation(replace(found, confidence=confidence if near else 0.01), cloud, cloud)
+
+        return attempt
+
+    first = find_similarity(cloud, cloud, attempt_with(1.0, 0.999))
+    last = find_similarity(cloud, cloud, attempt_with(1.2**7, 0.96))
+    assert first is not None and last is not None
+    assert first[0].result.ok and first[0].result.confidence == pytest.approx(999 / 1001)
+    assert last[0].result.status == "low_confidence" and last[1] == pytest.approx(1.2**7)
+    assert last[0].result.confidence == pytest.approx((24 / 16) / (1 + 24 / 16), rel=1e-3)
+    assert "15 scales were tried" in last[0].result.reasons[0]
 
 
 def test_what_is_too_far_apart_or_of_no_scale_is_refused() -> None:

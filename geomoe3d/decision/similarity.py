@@ -6,7 +6,8 @@ that size and registered. Registration bears an error of a fifth in scale, and w
 surfaces give the ratio (`geomoe3d.decision.scale`): the source is brought to that size, and all is done again. The
 first answer that is ok, its scale checked as that of any rigid answer is, ends the ladder. Surfaces lie on each other
 at wrong scales too, so its neighbours are asked until neither scores higher. A pair costs four to six registrations
-where the extents say about the truth, some twenty where no rung leads to an answer.
+where the extents say about the truth, some twenty where no rung leads to an answer. The more rungs were tried, the
+less the confidence of one is worth.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _STEP, _RUNGS = 1.2, 7  # from the ratio of extents up to 3.6 times more and les
 _LARGEST = 1100.0  # that of two extents is no more than about right
 _PROMISING = 0.3  # confidence from which surfaces are believed to say the ratio
 _MOST_SETTLING, _SETTLED = 4, 0.002
-_MOST_SETTLED = 3
+_MOST_THOROUGH = 2
+_LEAST_CONFIDENCE = 0.95
 _SAME = 0.02  # closer logarithms of ratios are those of one place
 
 
@@ -55,11 +57,50 @@ def find_similarity(
         tried.append((found, ratio))
         if found.result.confidence >= _PROMISING:
             settled.append(_settle(found, ratio, attempt))
-            if settled[-1][0].result.ok:
-                return _climb(*settled[-1], attempt)
-    tried.sort(key=lambda one: -one[0].result.confidence)
-    settled += [_settle(*one, attempt, always=True) for one in tried[: _MOST_SETTLED - len(settled)]]
-    return max(settled, key=lambda one: (one[0].result.ok, one[0].result.confidence))
+            if _one_of_many(settled[-1][0], len(tried)).result.ok:
+                best, at = _climb(*settled[-1], attempt)
+                return _one_of_many(best, len(tried)), at
+    settled += tried
+    settled.sort(key=_surest)
+    for _, ratio in _distinct(settled)[:_MOST_THOROUGH]:
+        settled.append(_settle(attempt(ratio, True), ratio, attempt, thorough=True))
+    best, at = min(settled, key=_surest)
+    return _one_of_many(best, len(tried)), at
+
+
+def _surest(one: tuple[Explanation, float]) -> tuple[bool, float]:
+    """Sorts by ok and confidence, the surest first."""
+    return not one[0].result.ok, -one[0].result.confidence
+
+
+def _distinct(ranked: list[tuple[Explanation, float]]) -> list[tuple[Explanation, float]]:
+    """Those whose ratio is not about that of one before."""
+    kept: list[tuple[Explanation, float]] = []
+    for one in ranked:
+        if all(abs(np.log(one[1] / other[1])) > _SAME for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _one_of_many(found: Explanation, num_tried: int) -> Explanation:
+    """An answer with the confidence that is left where several ratios were tried, each with a chance to look right.
+
+    The odds are divided by one more than their number; what then falls below the limit of ok is not ok.
+    """
+    result = found.result
+    odds = result.confidence / max(1 - result.confidence, 1e-12) / (1 + num_tried)
+    confidence = odds / (1 + odds)
+    least = result.config.get("decision", {}).get("min_confidence", _LEAST_CONFIDENCE)
+    if not result.ok or confidence >= least:
+        return replace(found, result=replace(result, confidence=confidence))
+    reason = (
+        f"confidence {confidence:.2f} is below {least:.2f}: {num_tried} scales were tried before one fitted, and each "
+        "may look right by chance"
+    )
+    doubted = replace(
+        result, confidence=confidence, status="low_confidence", reasons=(reason, *result.reasons)
+    )
+    return replace(found, result=doubted)
 
 
 def likely_ratios(source: PointCloud, target: PointCloud) -> list[float]:
@@ -70,23 +111,21 @@ def likely_ratios(source: PointCloud, target: PointCloud) -> list[float]:
 
 
 def _settle(
-    found: Explanation, ratio: float, attempt: Attempt, *, always: bool = False
+    found: Explanation, ratio: float, attempt: Attempt, *, thorough: bool = False
 ) -> tuple[Explanation, float]:
     """The same place registered anew at the ratio that its surfaces give, until that stays; the surest of these.
 
-    ``always``: once more even where the surfaces give none.
+    ``thorough``: at most once, with all looks.
     """
     best, at = found, ratio
-    for _ in range(_MOST_SETTLING):
+    for _ in range(1 if thorough else _MOST_SETTLING):
         off = found.result.evidence.get("scale_ratio")
-        if off is None and not always:
+        if off is None or abs(np.log(off)) < _SETTLED:
             break
-        ratio, always = ratio * (off or 1.0), False
-        found = attempt(ratio, True)
+        ratio *= off
+        found = attempt(ratio, thorough)
         if (found.result.ok, found.result.confidence) >= (best.result.ok, best.result.confidence):
             best, at = found, ratio
-        if off is not None and abs(np.log(found.result.evidence.get("scale_ratio", 1.0))) < _SETTLED:
-            break
     return best, at
 
 

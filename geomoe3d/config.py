@@ -142,6 +142,13 @@ class SecondLookConfig(Section):
         description="describes an answer's clouds once more where it is not ok: its matches join the others, its "
         "features score; a name as descriptor.name, with its defaults. none, or the same as that: no",
     )
+    min_confidence: float = Field(
+        0.98,
+        ge=0,
+        le=1,
+        description="an answer found with that descriptor is ok from this confidence on, which was fitted for the "
+        "first one; decision.min_confidence counts where it is higher",
+    )
     grids: tuple[float, ...] = Field(
         (1.5, 2.0),
         description="coarser grids, in voxels, on which further hypotheses are sought when the first answer "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from geomoe3d.estimators.proposals import propose
 from geomoe3d.features.base import Descriptor, descriptor, with_features, with_normals_flipped
 from geomoe3d.features.cache import FeatureCache, feature_identity
 from geomoe3d.filters.base import OutlierFilter, outlier_filter
+from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.matching.base import Matcher, matcher
 from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, judges_transforms, packaged_names
 from geomoe3d.parts import Part, Registry
@@ -114,14 +116,19 @@ class Pipeline:
         )
         return first, second
 
-    def match(self, clouds: Clouds, places: Places, clock: StageClock, limit: int | None = None) -> Pair:
-        """Putative correspondences; at most ``limit``, None takes what the configuration says."""
+    def match(
+        self, clouds: Clouds, places: Places, clock: StageClock, limit: int | None = None, draw: int = 0
+    ) -> Pair:
+        """Putative correspondences; at most ``limit``, None takes what the configuration says.
+
+        ``draw``: which of several independent ones.
+        """
         clock("match")
         needs = frozenset() if self.filter is None else self.filter.needs
         matched = self.matcher(
             *clouds,
             limit=limit or self.config.matching.max_correspondences,
-            seed=self.config.seed,
+            seed=self.config.seed + draw,
             with_ratio="ratio" in needs,
         )
         return self.pair(clouds, matched, places)
@@ -162,26 +169,26 @@ class Pipeline:
             raise ValueError("there is no second descriptor")
         clock("features")
         source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in pair.clouds)
-        own = self.match((source, target), places, clock)
-        return own, self.pair(own.clouds, pair.matched.with_others(own.matched), places)
+        own = self.match((source, target), places, clock, draw=1)  # other points than the first one's
+        return own, self.together((pair, own), places)
 
-    def further_pairs(
-        self,
-        looks: Sequence[Pair],
-        prepared: Clouds,
-        places: Places,
-        clock: StageClock,
-        sides: Sides = "sensor",
-    ) -> Iterator[Pair]:
-        """The same scans for a second look: more matches of their grid, where there are more, and coarser grids.
-
-        ``looks``: the pair as the first descriptor sees it and, if it was asked, as the second does; the coarser
-        grids are described by the last of them.
-        """
+    def more_matches(self, looks: Sequence[Pair], places: Places, clock: StageClock) -> list[Pair]:
+        """All matches of the grid, by each descriptor that was asked and had more than it gave."""
         usual, most = self.config.matching.max_correspondences, self.config.second_look.max_correspondences
-        for pair in looks:
-            if len(pair.matched) >= usual and most > usual:
-                yield self.match(pair.clouds, places, clock, most)
+        asked = [look for look in looks if len(look.matched) >= usual and most > usual]
+        return [self.match(look.clouds, places, clock, most) for look in asked]
+
+    def together(self, looks: Sequence[Pair], places: Places) -> Pair:
+        """The last look with the matches of all, mutual ones first, no more than two descriptors give at first."""
+        found = reduce(Correspondences.with_others, (look.matched for look in looks))
+        limit = 2 * self.config.matching.max_correspondences
+        drawn = drawn_rows(found.source, looks[0].voxel_size, limit, self.config.seed, first=found.mutual)
+        return self.pair(looks[-1].clouds, found.take(drawn), places)
+
+    def coarser_pairs(
+        self, prepared: Clouds, places: Places, clock: StageClock, sides: Sides, again: bool
+    ) -> Iterator[Pair]:
+        """The same scans on coarser grids; ``again``: described by the second descriptor."""
         for factor in self.config.second_look.grids:
             size = factor * prepared[0].voxel_size
             bare = tuple(PointCloud(cloud.points, cloud.origin, name=cloud.name) for cloud in prepared)
@@ -191,7 +198,7 @@ class Pipeline:
             except EmptyCloudError:  # a cloud is too small for this grid
                 continue
             coarse = self.flipped(coarse, clock) if sides == "flipped" else coarse
-            if len(looks) > 1 and self.second_descriptor is not None:
+            if again and self.second_descriptor is not None:
                 clock("features")
                 source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in coarse)
                 coarse = source, target

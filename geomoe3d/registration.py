@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import replace
+from itertools import chain
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -362,8 +363,8 @@ class Registrar:
         pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
         weighed, proposed = line.propose(pair, clock)
 
-        def select(pair: Pair, proposed: list[Hypothesis]) -> Selection:
-            selection = Selection(pair, line.scorers, line.refiner, self.config, clock)
+        def select(pair: Pair, proposed: list[Hypothesis], config: RegistrationConfig) -> Selection:
+            selection = Selection(pair, line.scorers, line.refiner, config, clock)
             selection.add(proposed)
             if rivals is not None:
                 selection.add(rivals.transforms())
@@ -371,18 +372,27 @@ class Registrar:
                 selection.add_guess(initial)
             return selection
 
+        least = max(self.config.decision.min_confidence, look.min_confidence)
+        decide = self.config.decision.model_copy(update={"min_confidence": least})
+        stricter = self.config.model_copy(update={"decision": decide})
         with single_blas_thread():
-            selection, looks = select(pair, proposed), [pair]
+            selection, looks = select(pair, proposed, self.config), [pair]
             decision = selection.decide()
             if given is None and sides == "sensor" and self._is_described_again(decision.judgement):
                 again, pair = line.described_again(pair, places, clock)
                 looks.append(again)
                 proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
-                weighed, selection = line.weigh(pair), select(pair, proposed)
+                weighed, selection = line.weigh(pair), select(pair, proposed, stricter)
                 decision = selection.decide(look.num_refined, look.num_judged)
             if self._is_doubtful(decision.judgement):
                 if given is None:
-                    for further in line.further_pairs(looks, prepared, places, clock, sides):
+                    more = line.more_matches(looks, places, clock)
+                    if len(looks) > 1:
+                        pair = line.together([*more, looks[0], looks[1]], places)
+                        proposed = [h.anew() for h in proposed]
+                        weighed, selection = line.weigh(pair), select(pair, proposed, stricter)
+                    coarser = line.coarser_pairs(prepared, places, clock, sides, len(looks) > 1)
+                    for further in chain(more, coarser):
                         selection.add(line.propose(further, clock)[1])
                 decision = selection.decide(look.num_refined, look.num_judged)
         return pair, weighed, decision

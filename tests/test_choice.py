@@ -13,6 +13,7 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision import selection as selection_module
 from geomoe3d.decision.selection import Selection, distinct
 from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.features.base import with_features
@@ -206,8 +207,8 @@ def grids_seen(monkeypatch):
     seen: list[float] = []
     match_clouds = Pipeline.match
 
-    def spy(self, clouds, places, clock, limit=None):
-        found = match_clouds(self, clouds, places, clock, limit)
+    def spy(self, clouds, places, clock, limit=None, **more):
+        found = match_clouds(self, clouds, places, clock, limit, **more)
         seen.append(round(clouds[0].voxel_size / VOXEL, 6))
         if limit is not None:
             seen.append(len(found.matched))
@@ -274,8 +275,10 @@ def test_an_answer_that_is_not_ok_is_described_again_and_both_kinds_of_matches_a
     assert found.result.num_correspondences == len(rows)
     grids_seen.clear()
     unsure = load_config(None, [*settings, "second_look.below=1.0", "second_look.max_correspondences=700"])
-    Registrar(unsure).register(source, target)
+    more = Registrar(unsure).explain(source, target)
     assert grids_seen == [1, 1, 1, 700, 1, 700, 1.5, 2]  # more matches by either, coarser grids by the second
+    assert len(more.correspondences) == 1000  # of all of them, mutual ones first
+    assert more.correspondences.mutual.all()
 
 
 def test_the_descriptor_of_the_second_look_decides_identity_and_may_be_none_or_one_of_your_own(tmp_path):
@@ -299,6 +302,24 @@ def test_the_descriptor_of_the_second_look_decides_identity_and_may_be_none_or_o
     assert line(f"{own}:Blind").second_descriptor.dimension == 2
     with pytest.raises(ConfigError, match=r"'learnt'; did you mean 'learned'"):
         line("learnt")
+
+
+def test_an_answer_of_the_second_descriptor_must_be_surer(monkeypatch):
+    asked, judge = [], selection_module.judge
+
+    def spy(*given):
+        asked.append(given[5].min_confidence)
+        return judge(*given)
+
+    monkeypatch.setattr(selection_module, "judge", spy)
+    source, target, _ = make_sample_pair(seed=0)
+    for decision, second, expected in ((0.99999, 1.0, [0.99999, 1.0]), (1.0, 0.98, [1.0, 1.0])):
+        asked.clear()
+        limits = [f"decision.min_confidence={decision}", f"second_look.min_confidence={second}"]
+        result = Registrar(load_config(None, [f"voxel_size={VOXEL}", *limits])).register(source, target)
+        assert asked[:2] == expected  # what comes after asks by the first descriptor
+        assert result.status == "low_confidence"
+    assert RegistrationConfig().second_look.min_confidence > RegistrationConfig().decision.min_confidence
 
 
 def test_a_user_s_own_matches_are_not_described_again(grids_seen):

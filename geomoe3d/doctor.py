@@ -51,13 +51,13 @@ REQUIRED_MODULES = {
     "scipy.spatial": "scipy>=1.12",
     "pydantic": "pydantic>=2.7",
     "yaml": "pyyaml>=6.0",
-    "click": "click>=8.1",
+    "click": "click>=8.1.3",
     "rich": "rich>=13.7",
     "safetensors": "safetensors>=0.4.3",
     "matplotlib": "matplotlib>=3.8",
-    "jinja2": "jinja2>=3.1",
+    "jinja2": "jinja2>=3.1.2",
     "trimesh": "trimesh>=4.4",
-    "small_gicp": "small_gicp>=1.0",
+    "small_gicp": "small_gicp>=1.0.1",
     "threadpoolctl": "threadpoolctl>=3.1",
 }
 """Module to import, and what to ask pip for; torch and Open3D have checks of their own."""

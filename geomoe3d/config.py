@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -253,7 +253,10 @@ def known_keys(section: type[Section], prefix: str = "") -> list[str]:
     keys: list[str] = []
     for name, info in section.model_fields.items():
         kind = info.annotation
-        if isinstance(kind, type) and issubclass(kind, Section):
+        is_class = (
+            isinstance(kind, type) and get_origin(kind) is None
+        )  # Python 3.10 takes list[int] for a type
+        if is_class and issubclass(kind, Section):
             keys += known_keys(kind, f"{prefix}{name}.")
         else:
             keys.append(prefix + name)

@@ -253,10 +253,8 @@ def known_keys(section: type[Section], prefix: str = "") -> list[str]:
     keys: list[str] = []
     for name, info in section.model_fields.items():
         kind = info.annotation
-        is_class = (
-            isinstance(kind, type) and get_origin(kind) is None
-        )  # Python 3.10 takes list[int] for a type
-        if is_class and issubclass(kind, Section):
+        generic = get_origin(kind) is not None  # Python 3.10 takes list[int] for a type
+        if not generic and isinstance(kind, type) and issubclass(kind, Section):
             keys += known_keys(kind, f"{prefix}{name}.")
         else:
             keys.append(prefix + name)

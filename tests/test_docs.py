@@ -20,8 +20,6 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 OURS = [DOCS / "quickstart.md", *sorted(DOCS.glob("how-to/*.md"))]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
-STILL_LONG = {"measurements"}
-"""Pages whose paragraphs are laid out anew when nobody is writing in them."""
 
 
 def blocks(page, *languages):
@@ -137,7 +135,7 @@ def test_links_lead_somewhere(page):
             assert (page.parent / link).exists(), link
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.stem not in STILL_LONG], ids=name_of)
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_lines_are_short(page):
     """Those of tables and of code cannot be broken."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)

@@ -102,8 +102,8 @@ def _card(row: PairRow, outcome: Outcome, image: str, blank: str, pages: Abstrac
     page = page_name(row.id)
     return {
         "page": f"{PAGES_FOLDER}/{quote(page)}" if page in pages else "",
-        "confidence": f"{outcome.confidence:.4f}",
-        "overlap": f"{result.overlap:.4f}" if result and np.isfinite(result.overlap) else "0",
+        "confidence": repr(float(outcome.confidence)),
+        "overlap": repr(float(result.overlap)) if result and np.isfinite(result.overlap) else "0",
         "image": image,
         "blank": blank,
         "status": outcome.status,

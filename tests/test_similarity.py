@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call, install_registrar, write_scans
+from headless_browser import browse
 from registration_views import make_result, room_view
 from scipy.spatial.transform import Rotation
 
 import geomoe3d
+from geomoe3d.batch.folder import write_transforms
 from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.clouds.moved import moved
@@ -131,7 +133,7 @@ def test_normals_keep_their_length(tmp_path: Path) -> None:
         np.testing.assert_allclose(points_array(turned.normals), normals @ R.T, atol=1e-5)
 
 
-def test_the_page_names_the_scale() -> None:
+def test_the_page_names_the_scale_and_moves_by_it(tmp_path: Path) -> None:
     view = room_view()
     T = view.result.T_target_source.copy()
     T[:3, :3] *= FEET
@@ -145,6 +147,19 @@ def test_the_page_names_the_scale() -> None:
     assert shown.kept().sum() == view.kept().sum()
     text = render_page(shown)
     assert "= 0.3048 R p" in text and "lengths of the target over those of the source" in text
+    half_way = browse(tmp_path, text, script="", wish="#at=0.5&renderer=canvas2d")["model"]
+    model = np.array([float(v) for v in half_way.split()]).reshape(4, 4).T  # a similarity on the way too
+    assert scale_of(model) == pytest.approx(np.sqrt(FEET), rel=1e-9)
+    np.testing.assert_allclose(model[:3, :3] @ model[:3, :3].T, FEET * np.eye(3), atol=1e-9)
+
+
+def test_a_batch_says_the_scale_in_its_transforms_and_knows_them_again(tmp_path: Path) -> None:
+    write_transforms(tmp_path, [("pair", similar_result())])
+    path = tmp_path / "pair.txt"
+    assert "p_target = 0.3048 R p_source + t" in path.read_text()
+    np.testing.assert_array_equal(load_transform(path), SIMILAR)
+    write_transforms(tmp_path, [("other", similar_result())])  # its own of before are taken away
+    assert not path.exists()
 
 
 def test_the_ladder_begins_at_the_extents_and_stays_within_a_thousand() -> None:

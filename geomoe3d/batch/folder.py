@@ -29,7 +29,7 @@ _KIND = "geomoe3d batch "
 _HEAD_BYTES = 4096  # marks stand in the first lines
 _LONGEST_NAME = 255  # bytes, of nearly every file system
 _TRANSFORM_HEAD = re.compile(  # the rows stand behind the remarks in batches of old
-    r"(?:[^#\n]*\n){0,4}# maps SOURCE \(.*\) into TARGET \(.*\): p_target = R p_source \+ t\r?\n"
+    r"(?:[^#\n]*\n){0,4}# maps SOURCE \(.*\) into TARGET \(.*\): p_target = (?:[\d.e+-]+ )?R p_source \+ t\r?\n"
     r"# status \w+, confidence [\d.]+\r?\n(?:# pair (.*?)\r?\n)?(?:[^#]|$)"
 )
 
@@ -213,8 +213,9 @@ def write_transforms(folder: Path, results: Iterable[tuple[str, RegistrationResu
     for name, result in results:
         path = folder / transform_name(name)
         names = f"SOURCE ({result.source.name}) into TARGET ({result.target.name})"
+        times = "" if result.scale == 1.0 else f"{result.scale:.9g} "
         comments = [
-            f"maps {names}: p_target = R p_source + t",
+            f"maps {names}: p_target = {times}R p_source + t",
             f"status {result.status}, confidence {result.confidence:.4f}",
             f"pair {path.stem}",
         ]

@@ -115,8 +115,10 @@ class Search:
         windows = self._query.windows(_MORE_WINDOWS if more else _WINDOWS, within)
         self._clock("propose")
         scored = [(self._quick(T), Hypothesis(T)) for T in given]
+        # What was known before did not convince, or it would not be asked again.
+        plain = max([_PLAIN, *(1.05 * score for score, _ in scored)]) if more else _PLAIN
         for number, window in enumerate(windows):
-            if number >= _FIRST_WINDOWS and max((q for q, _ in scored), default=0.0) > _PLAIN:
+            if number >= _FIRST_WINDOWS and max((q for q, _ in scored), default=0.0) > plain:
                 break
             proposed = self._query.motions(window, _PER_WINDOW, fine=more)
             if near is not None:

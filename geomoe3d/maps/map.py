@@ -39,7 +39,8 @@ from geomoe3d.result import RegistrationResult, Status
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-_MOST_VOXELS = 1_000_000
+_MOST_VOXELS = 4_000_000
+_USUAL_POINTS = 200_000  # of the grid on which a map is described before any scan is known
 _PIECE = 1_000_000
 _NEAR_SIZE = 1.3  # a level whose voxels are so many times as large or small as the scan's own serves it
 _CANDIDATES = 4
@@ -142,7 +143,7 @@ class Map:
 
         Args:
             cloud: anything `load_points` takes; LAS and LAZ files are read in pieces, so that memory is bounded by
-                what the map keeps: a million voxels at most, on a grid twice as wide where that is not enough.
+                what the map keeps: four million voxels at most, on a grid twice as wide where that is not enough.
             sensor: (3,) where the one sensor stood, file coordinates; None takes what the file itself says, and none
                 where it says nothing, as merged clouds do. The origin of a map is never taken for one.
             config: of the registrations; None takes the defaults.
@@ -230,8 +231,8 @@ class Map:
         """Describe the map on a grid now, so that the first scan need not wait for it.
 
         Args:
-            voxel_size: cloud units, at least that of the map's voxels; None takes that of the configuration, or one and
-                a quarter of the map's.
+            voxel_size: cloud units, at least that of the map's voxels; None takes that of the configuration, or one on
+                which the map has some 200,000 points at most.
             progress: called with the name of the stage.
 
         Raises:
@@ -241,7 +242,9 @@ class Map:
             raise EmptyCloudError("the map holds no points yet; add a cloud first: map.with_cloud(...)")
         if progress is not None:
             progress("describe")
-        self._level(voxel_size or self.config.voxel_size or float(f"{1.25 * self._voxels.edge:.2g}"))
+        # Surfaces fill voxels like 1 / size^2.
+        usual = self._voxels.edge * max(1.25, math.sqrt(len(self._voxels) / _USUAL_POINTS))
+        self._level(voxel_size or self.config.voxel_size or float(f"{usual:.2g}"))
 
     @property
     def num_points(self) -> int:

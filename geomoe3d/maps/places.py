@@ -79,6 +79,8 @@ class Query:
             count: at most so many.
             within: (3,) where the scan's centre is said to lie, local coordinates, and how far off at most.
         """
+        from scipy.spatial import cKDTree
+
         level, edge, asked = self.level.first, self.radius / 1.5, self._some.features
         cells = np.floor(level.points / edge).astype(np.int64)
         cells -= cells.min(0)
@@ -89,7 +91,8 @@ class Query:
         used = flat[order][starts]
         sorted_features = np.ascontiguousarray(level.features[order].T)
         places = np.stack(np.unravel_index(used, tuple(shape)), axis=1)
-        around = np.linalg.norm(places[:, None] - places[None], axis=2) * edge <= 1.25 * self.radius
+        tree = cKDTree(places)
+        members = tree.query_ball_point(places, 1.25 * self.radius / edge + 1e-6, return_sorted=True)
         best = np.concatenate(
             each(
                 lambda start: np.maximum.reduceat(
@@ -98,8 +101,8 @@ class Query:
                 range(0, len(asked), _ROWS),
             )
         )
-        members = [np.flatnonzero(row) for row in around]
-        most = np.stack([best[:, m].max(1) for m in members], axis=1)  # (asked, windows)
+        by_cell = np.ascontiguousarray(best.T)
+        most = np.stack([by_cell[m].max(0) for m in members], axis=1)  # (asked, windows)
         votes = _votes(most)
         counts = np.add.reduceat(np.ones(len(order)), starts)
         sums = np.add.reduceat(level.points[order], starts, axis=0)

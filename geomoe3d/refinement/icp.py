@@ -73,6 +73,9 @@ class CloudAligner:
     def __call__(self, T_target_source: FloatArray) -> tuple[FloatArray, str | None]:
         """The motion polished so that the source's points lie in the target's surface.
 
+        Twice: where the library stops hangs on where it began, by a tenth of a voxel at times, and hardly any more on
+        where a second course began.
+
         Args:
             T_target_source: (4, 4) start, local coordinates.
 
@@ -81,6 +84,12 @@ class CloudAligner:
             own `converged` is true even where nothing matched, so the number of matched points, finiteness
             and the distance moved are checked here.
         """
+        found, note = self._polished(T_target_source)
+        if note is not None:
+            return found, note
+        return self._polished(found)[0], None
+
+    def _polished(self, T_target_source: FloatArray) -> tuple[FloatArray, str | None]:
         config = self._config
         voxel = self._voxel
         start = T_target_source.copy()

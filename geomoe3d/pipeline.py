@@ -28,7 +28,7 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import Scorer, make_scorers, scorer
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-_LINE = ("geomoe3d.registration", "geomoe3d.correspondence_registration")
+_LINE = ("geomoe3d.registration", "geomoe3d.line", "geomoe3d.correspondence_registration")
 
 
 REGISTRIES: dict[str, Registry[Any]] = {

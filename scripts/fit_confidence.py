@@ -5,11 +5,11 @@
 
 FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
 recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix them, unrelated ones from
-different scenes. Every pair is registered twice, without a second look and always with one, since the
-confidence decides about it; the outcomes go to OUT, and what is there is not done again: give another OUT for
-other weights or code. Prints
-coefficients for `geomoe3d/decision/confidence.py`, cross-validated over scenes. Needs scikit-learn, which the
-package itself does not.
+different scenes and, every second, from far parts of one. Every pair is registered twice, without a second
+look and always with one, since the confidence decides about it; the outcomes go to OUT, and what is there is
+not done again: give another OUT for other weights or code. Prints coefficients for
+`geomoe3d/decision/confidence.py`, cross-validated over scenes. Needs scikit-learn, which the package itself
+does not.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import fields
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,11 @@ LOOKS = (
 
 
 def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str, str, list[Any] | None]]:
-    """(scene, source, target, true motion or None), the same for the same folders and counts."""
+    """(scene, source, target, true motion or None), the same for the same folders and counts.
+
+    Of the unrelated ones every second is of one scene, two fragments that no list says to overlap: furniture that
+    stands twice and walls at right angles imitate each other more than two buildings do.
+    """
     rng = np.random.default_rng(0)
     by_scene: dict[str, list[PosedPair]] = {}
     for folder in folders:
@@ -57,11 +62,21 @@ def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str,
             scene, pair = band[k]
             chosen.append((scene, str(pair.source), str(pair.target), pair.T_target_source.tolist()))
     names = sorted(by_scene)
-    for _ in range(unrelated):
+    apart = [pair for scene in names for pair in unlisted(scene, by_scene[scene])]
+    for k in rng.permutation(len(apart))[: unrelated // 2]:
+        chosen.append((*apart[k], None))
+    for _ in range(unrelated - unrelated // 2):
         a, b = rng.choice(len(names), 2, replace=False)
         source, target = (by_scene[names[k]][rng.integers(len(by_scene[names[k]]))].source for k in (a, b))
         chosen.append((f"{names[a]} {names[b]}", str(source), str(target), None))
     return [chosen[k] for k in rng.permutation(len(chosen))]
+
+
+def unlisted(scene: str, pairs: list[PosedPair]) -> list[tuple[str, str, str]]:
+    """(scene, source, target) of every two fragments of a scene that no list says to overlap."""
+    listed = {frozenset((pair.source, pair.target)) for pair in pairs}
+    clouds = sorted(set().union(*listed))
+    return [(scene, str(a), str(b)) for a, b in combinations(clouds, 2) if frozenset((a, b)) not in listed]
 
 
 def measure(

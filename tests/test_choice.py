@@ -216,7 +216,7 @@ def grids_seen(monkeypatch):
         return found
 
     monkeypatch.setattr(Pipeline, "match", spy)
-    monkeypatch.setattr(Registrar, "_mirrored", lambda *_: None)  # asks a pair of its own
+    monkeypatch.setattr("geomoe3d.line.mirrored_axes", lambda *_: None)  # registers a pair of its own
     return seen
 
 

@@ -291,6 +291,7 @@ ORDER = [
     {"pipeline"},
     {"maps"},
     {"correspondence_registration"},
+    {"line"},
     {"registration"},
     {"evaluation", "training", "batch", "multiway"},
     {"cli", "__main__"},

@@ -18,13 +18,19 @@ from dataclasses import replace
 import numpy as np
 
 from geomoe3d.clouds.prepare import robust_extent
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.decision.answer import failed_result
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.scale import DIFFERS, seeming_units
 from geomoe3d.result import RegistrationResult
+from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, PointCloud
 
 Attempt = Callable[[float, bool], Explanation]
 """The source with its lengths divided by a ratio, on the target; True: with all looks at a doubtful pair."""
+
+Explain = Callable[..., Explanation]
+"""`Registrar.explain`."""
 
 _STEP, _RUNGS = 1.2, 7  # from the ratio of extents up to 3.6 times more and less
 _LARGEST = 1100.0  # that of two extents is no more than about right
@@ -33,6 +39,47 @@ _MOST_SETTLING, _SETTLED = 4, 0.002
 _MOST_THOROUGH = 2
 _LEAST_CONFIDENCE = 0.95
 _SAME = 0.02  # closer logarithms of ratios are those of one place
+
+
+def explain_similarity(
+    clouds: tuple[PointCloud, PointCloud],
+    rows: FloatArray | None,
+    config: RegistrationConfig,
+    quick: Explain,
+    thorough: Explain,
+    clock: StageClock,
+    progress: Progress | None,
+) -> Explanation:
+    """The similarity of two clouds, with what led to it, by rigid answers at many ratios.
+
+    Args:
+        clouds: source and target as loaded.
+        rows: (N, 6) a user's own matches, file coordinates, or None.
+        config: that the result says it was made with.
+        quick, thorough: rigid registration with one look, and with all.
+        clock: told of the stages.
+        progress: told of those of every registration.
+    """
+
+    def attempt(ratio: float, thoroughly: bool) -> Explanation:
+        clock("scale")
+        shrunk = None if rows is None else rows / ([ratio] * 3 + [1.0] * 3)
+        smaller = scaled_cloud(clouds[0], 1 / ratio)
+        explain = thorough if thoroughly else quick
+        return explain(smaller, clouds[1], correspondences=shrunk, progress=progress)
+
+    best = find_similarity(*clouds, attempt)
+    if best is None:
+        extents = [robust_extent(cloud.points) for cloud in clouds]
+        reason = (
+            f"the extents of '{clouds[0].name}' and '{clouds[1].name}' are {extents[0]:.4g} and {extents[1]:.4g}; "
+            "a scale between 1/1000 and 1000 is sought, so bring them nearer to one unit first"
+        )
+        return Explanation(failed_result(clouds, reason, config, clock.stop()), *clouds)
+    found, ratio = best
+    stages = {**found.result.seconds, **clock.stop()}
+    result = replace(found.result, config=config.model_dump(mode="json"), seconds=stages)
+    return as_similarity(found, ratio, clouds[0], result)
 
 
 def find_similarity(

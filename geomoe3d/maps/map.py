@@ -478,7 +478,7 @@ def _near(near: ArrayLike | None, within: float | None, k: int) -> tuple[FloatAr
 def search_larger(
     scan: PointCloud, world: PointCloud, line: Pipeline, guess: FloatArray | None, clock: StageClock
 ) -> Found | None:
-    """One cloud sought in a much larger one: what `geomoe3d.registration` does with such a pair.
+    """One cloud sought in a much larger one: what `geomoe3d.line` does with such a pair.
 
     Args:
         scan: the smaller cloud, as loaded.

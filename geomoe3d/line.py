@@ -1,0 +1,261 @@
+"""From two loaded clouds to an answer: choose the grid, look, check, finish.
+
+`Line._look` is the line itself: match, propose, score, refine, decide. A doubtful pair is looked at again, with the
+matches of a second descriptor, with more matches, on coarser grids, and with normals turned to other sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from geomoe3d.clouds.pair import Pair
+from geomoe3d.clouds.prepare import bounded_voxel_size, own_voxel_sizes, round_size
+from geomoe3d.clouds.viewpoint import MOST_SIGN_BREAKS, find_viewpoints, known_viewpoints, sign_breaks
+from geomoe3d.config import RegistrationConfig
+from geomoe3d.correspondence_registration import between_clouds
+from geomoe3d.decision.accuracy import measure_accuracy
+from geomoe3d.decision.answer import Decision, failed_result, finished_result
+from geomoe3d.decision.causes import Register, differing_units, mirrored_axes
+from geomoe3d.decision.confidence import Judgement
+from geomoe3d.decision.explanation import Explanation
+from geomoe3d.decision.remarks import data_remarks, remarks
+from geomoe3d.decision.scale import measure_scale
+from geomoe3d.decision.selection import Selection
+from geomoe3d.geometry.se3 import inverse
+from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
+from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.network import NETWORK, opinion_of
+from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, PointCloud
+
+_LARGER = 3.0
+"""Ratio of the voxel sizes that two clouds would get by themselves from which the larger is taken for a map; of 1,941
+pairs of scans measured the largest was 2.6, of a depth camera's view in its room three to four."""
+
+
+class Look(NamedTuple):
+    """What one look at a pair gave: the clouds and matches that were judged, what the filter said, the decision."""
+
+    pair: Pair
+    weighed: FilterOutput
+    decision: Decision
+
+
+class Again(NamedTuple):
+    """Registers two clouds at the scale that they have, to find what is wrong with a pair: with all looks, with one."""
+
+    fully: Register
+    quickly: Register
+
+
+@dataclass
+class Line:
+    """What becomes of one pair.
+
+    Attributes:
+        pipeline: the parts.
+        config: that the result says it was made with.
+        clock: told of the stages.
+        initial: a user's first guess (4, 4), file coordinates, or None.
+        given: (N, 6) a user's own matches, file coordinates, which then take the place of ours, or None.
+        again: asked for what is wrong with a pair that is not ok; None: that is not asked.
+        once: whether the first look is all.
+    """
+
+    pipeline: Pipeline
+    config: RegistrationConfig
+    clock: StageClock
+    initial: FloatArray | None = None
+    given: FloatArray | None = None
+    again: Again | None = None
+    once: bool = False
+
+    def explain(
+        self,
+        data: tuple[Any, Any],
+        clouds: tuple[PointCloud, PointCloud],
+        exchanged: bool,
+    ) -> Explanation:
+        """The answer, with what led to it, for clouds in the order of the line.
+
+        Args:
+            data: source and target as the user gave them.
+            clouds: the same, loaded, in the order of the line.
+            exchanged: whether the user calls the second of them the source.
+        """
+        config, clock = self.config, self.clock
+        clock("prepare")
+        wanted = config.voxel_size
+        if wanted is None:
+            sizes = own_voxel_sizes(*clouds, config.preparation.voxel_points)
+            if self.given is None and self._is_map(sizes):
+                if sizes[0] <= sizes[1]:
+                    return self._in_map(clouds, self.initial)
+                back = None if self.initial is None else inverse(self.initial)
+                return self._in_map(clouds[::-1], back).exchanged()
+            wanted = round_size(max(sizes))
+        voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
+        look, believed = self._best(clouds, voxel_size)
+        clock("decide")
+        decision = look.decision
+        if decision.answer is not None:
+            scale = measure_scale(decision.T_target_source, *look.pair.clouds)
+            decision = decision.with_scale(scale, exchanged=exchanged)
+        if decision.judgement.status != "ok":
+            units = self._units(clouds[::-1] if exchanged else clouds)
+            decision = decision if units is None else decision.with_note(units, first=True)
+        if config.second_look.mirror and self.again is not None:
+            mirrored = mirrored_axes(clouds, decision, self.again.quickly, clock)
+            decision = decision if mirrored is None else decision.doubted(mirrored)
+        told_of = remarks(data, look.pair.clouds, wanted, believed, config.preparation, decision.judgement)
+        causes = () if decision.judgement.status == "ok" else data_remarks(clouds, wanted, config.preparation)
+        for remark in (*clouds[0].notes, *clouds[1].notes, *causes, *told_of):
+            decision = decision.with_note(remark)
+        return self._finished(look._replace(decision=decision), clouds)
+
+    def _best(self, clouds: tuple[PointCloud, PointCloud], voxel_size: float) -> tuple[Look, bool]:
+        """The surest look at two clouds on a grid, and whether the places of the sensors were believed."""
+        rule = self.config.preparation.viewpoint
+        views = find_viewpoints(*clouds, rule)
+        prepared = self.pipeline.prepare_both(clouds, voxel_size, views, self.clock)
+        # Known places, not guessed ones: the network was trained on true ones, or none.
+        places = known_viewpoints(*clouds, rule)
+        best = self._look(prepared, places)
+        for sides in self._other_sides(prepared, places):
+            if best.decision.judgement.status == "ok":
+                break
+            if sides == "centroid":
+                prepared = self.pipeline.prepare_both(clouds, voxel_size, (None, None), self.clock, sides)
+            other = self._look(prepared, None, sides, best.decision)
+            surer = other.decision.judgement.confidence > best.decision.judgement.confidence
+            # Without sensors less speaks against a wrong answer, so it is taken only where it is sure.
+            if surer and (sides == "flipped" or other.decision.judgement.status == "ok"):
+                best = other
+        return best, places is not None
+
+    def _look(
+        self,
+        prepared: Clouds,
+        places: Places,
+        sides: Sides = "sensor",
+        rivals: Decision | None = None,
+    ) -> Look:
+        """From clouds with features to a decision; a doubtful one with hypotheses of another descriptor and of coarser
+        grids too.
+
+        Args:
+            prepared: both clouds on one grid.
+            places: where the sensors are believed to have stood, local coordinates.
+            sides: where normals point, on every grid.
+            rivals: what an earlier look decided; this one's answer must beat what was found before, as in
+                repeated structure.
+        """
+        line, clock, look, given = self.pipeline, self.clock, self.config.second_look, self.given
+        clouds = line.flipped(prepared, clock) if sides == "flipped" else prepared
+        matched = None if given is None else between_clouds(given, prepared)
+        pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
+        weighed, proposed = line.propose(pair, clock)
+
+        def select(pair: Pair, proposed: list[Hypothesis], config: RegistrationConfig) -> Selection:
+            selection = Selection(pair, line.scorers, line.refiner, config, clock)
+            selection.add(proposed)
+            if rivals is not None:
+                selection.add(rivals.transforms())
+            if self.initial is not None:
+                selection.add_guess(self.initial)
+            return selection
+
+        least = max(self.config.decision.min_confidence, look.min_confidence)
+        decide = self.config.decision.model_copy(update={"min_confidence": least})
+        stricter = self.config.model_copy(update={"decision": decide})
+        with single_blas_thread():
+            selection, looks = select(pair, proposed, self.config), [pair]
+            decision = selection.decide()
+            if given is None and sides == "sensor" and self._is_described_again(decision.judgement):
+                again, pair = line.described_again(pair, places, clock)
+                looks.append(again)
+                proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
+                weighed, selection = line.weigh(pair), select(pair, proposed, stricter)
+                decision = selection.decide(look.num_refined, look.num_judged)
+            if self._is_doubtful(decision.judgement):
+                if given is None:
+                    more = line.more_matches(looks, places, clock)
+                    if len(looks) > 1:
+                        pair = line.together([*more, looks[0], looks[1]], places)
+                        proposed = [h.anew() for h in proposed]
+                        weighed, selection = line.weigh(pair), select(pair, proposed, stricter)
+                    coarser = line.coarser_pairs(prepared, places, clock, sides, len(looks) > 1)
+                    for further in chain(more, coarser):
+                        selection.add(line.propose(further, clock)[1])
+                decision = selection.decide(look.num_refined, look.num_judged)
+        return Look(pair, weighed, decision)
+
+    def _is_described_again(self, judgement: Judgement) -> bool:
+        """Whether the second descriptor is to be asked."""
+        known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
+        return known and judgement.status != "ok" and not self.once
+
+    def _is_doubtful(self, judgement: Judgement) -> bool:
+        """Whether a second look is to be taken, at more matches and on coarser grids."""
+        look = self.config.second_look
+        doubtful = judgement.status != "ok" and judgement.confidence < look.below
+        wanted = bool(look.grids) or look.max_correspondences > 0
+        return doubtful and bool(self.pipeline.scorers) and wanted and not self.once
+
+    def _other_sides(self, prepared: Clouds, places: Places) -> Iterator[Sides]:
+        """Which other sides of normals a pair that is not ok is asked with.
+
+        Where no sensor is known, the source's turned over: a guessed sensor may stand on the wrong side of
+        everything, and then no feature of one scan is like the other's. Then all turned to the centroid, as suits
+        objects, meshes and merged scans, which no sensor saw as a whole; where sensors are believed, only if the
+        normals that follow from that contradict themselves.
+        """
+        if not self.config.second_look.flip or not self.pipeline.scorers or self.once:
+            return
+        if places is None:
+            yield "flipped"
+        automatic = self.config.preparation.viewpoint == "auto"
+        if automatic and (places is None or max(map(sign_breaks, prepared)) > MOST_SIGN_BREAKS):
+            yield "centroid"
+
+    def _finished(self, look: Look, clouds: tuple[PointCloud, PointCloud]) -> Explanation:
+        """The result of a look, with what led to it."""
+        pair, weighed, decision = look
+        if decision.answer is not None:
+            T = decision.T_target_source
+            accuracy = measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold)
+            decision = replace(decision, accuracy=accuracy)
+        if NETWORK in self.pipeline.scorers:
+            opinion = opinion_of(decision.answer)
+            said = None if opinion is None else opinion.output
+            weighed = said or FilterOutput(np.zeros(len(pair.matched)))
+        result = finished_result(pair, decision, self.config, self.clock.stop())
+        inliers = decision.residuals(pair.matched) < pair.inlier_threshold
+        return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
+
+    def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
+        return None if self.again is None else differing_units(clouds, self.again.fully, self.clock)
+
+    def _is_map(self, sizes: tuple[float, float]) -> bool:
+        """Whether one cloud is so much larger or sparser than the other that what both share is a small part of it."""
+        return self.again is not None and max(sizes) >= _LARGER * min(sizes)
+
+    def _in_map(self, clouds: tuple[PointCloud, PointCloud], guess: FloatArray | None) -> Explanation:
+        """The first cloud sought in the second, much larger one."""
+        from geomoe3d.maps.map import NOWHERE, search_larger
+
+        found = search_larger(*clouds, self.pipeline, guess, self.clock)
+        if found is None or found.decision.answer is None:
+            return Explanation(failed_result(clouds, NOWHERE, self.config, self.clock.stop()), *clouds)
+        decision = found.decision
+        if decision.judgement.status != "ok" and (units := self._units(clouds)) is not None:
+            decision = decision.with_note(units, first=True)
+        for remark in clouds[1].notes:
+            decision = decision.with_note(remark)
+        weighed = FilterOutput(np.zeros(len(found.pair.matched)))
+        return self._finished(Look(found.pair, weighed, decision), clouds)

@@ -9,7 +9,7 @@ import pytest
 from generated_buildings import GRID, first_room, other_room, scanned, view
 
 import geomoe3d
-from geomoe3d import Map, registration
+from geomoe3d import Map, line
 from geomoe3d.cli.errors import BAD_INPUT, OK, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
@@ -254,7 +254,7 @@ def test_a_laz_is_read_in_pieces(tmp_path):
 
 def test_register_seeks_the_small_cloud_in_the_large_one_whichever_comes_first(building, scan, monkeypatch):
     points, true = scan
-    monkeypatch.setattr(registration, "_LARGER", 1.2)  # two rooms are not many
+    monkeypatch.setattr(line, "_LARGER", 1.2)  # two rooms are not many
     back = geomoe3d.register(building, points)
     assert back.ok
     assert "places" in back.seconds

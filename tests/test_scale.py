@@ -110,4 +110,7 @@ def test_two_units_are_named_where_the_clouds_fit_in_one(factor: float, unit: st
     source, target = cut(points, 0.0, 3.6, seed=0)[0], cut(points, 0.4, 4.6, seed=1)[0]
     result = geomoe3d.register(factor * source, target)
     assert not result.ok
-    assert f"the source seems to be in {unit}, the target in metres" in result.reasons[0]
+    said = result.reasons[0]  # whichever of the two is asked about first
+    assert f"'source' seems to be in {unit}, 'target' in metres" in said or (
+        f"'target' seems to be in metres, 'source' in {unit}" in said
+    )

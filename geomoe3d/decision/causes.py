@@ -38,9 +38,10 @@ def differing_units(
         return None
     if not fits:
         return None
+    names = f"'{source.name}'", f"'{target.name}'"  # not roles, which may be exchanged here
     return (
         f"units differ: with all lengths of '{source.name}' divided by {ratio:.6g} the clouds fit"
-        f"{seeming_units(ratio)}; bring both to one unit, a rigid motion cannot change scale"
+        f"{seeming_units(ratio, names)}; bring both to one unit, a rigid motion cannot change scale"
     )
 
 

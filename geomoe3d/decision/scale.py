@@ -120,12 +120,12 @@ class _Fit:
         return float(np.hypot(_PER_DISTORTION * distortion, _PER_FORMAL * formal))
 
 
-def seeming_units(ratio: float) -> str:
+def seeming_units(ratio: float, names: tuple[str, str] = ("the source", "the target")) -> str:
     """An end of a sentence that names the two units in which one body gives this ratio of lengths, to 2 %; else
     empty. Feet are international or US survey ones, which differ by two millionths."""
     for (source, target), expected in _unit_ratios().items():
         if abs(np.log(ratio / expected)) < _UNIT_TOLERANCE:
-            return f"; the source seems to be in {source}, the target in {target}"
+            return f"; {names[0]} seems to be in {source}, {names[1]} in {target}"
     return ""
 
 

@@ -435,7 +435,6 @@ def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):
 def test_the_command_says_what_it_will_take_and_exits_with_three(scans, finished, tmp_path):
     done = run_cli(scans[0] / "pairs.csv", tmp_path / "o", *OPTIONS, "--workers", "1", check=3)
     assert re.search(r"1 worker of about 0\.\d GiB, each held to [\d.]+ GiB", done.stderr)
-    assert "5 of 5 pairs" in done.stderr
     assert re.search(r"ok +3 +60\.0%", done.stdout)
     assert "broken.ply" in done.stdout
     assert (tmp_path / "o" / RESULTS_FILE).read_bytes() == (finished[1] / RESULTS_FILE).read_bytes()

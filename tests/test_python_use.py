@@ -9,6 +9,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -310,6 +311,16 @@ def test_long_work_shows_progress_unless_told_not_to(capsys, monkeypatch):
     count_to_three(progress=lambda done, total: told.append((done, total)))
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("shell", "notebook"), [(None, False), (object(), False), (SimpleNamespace(kernel=1), True)]
+)
+def test_a_notebook_is_where_a_kernel_runs_the_program(shell, notebook, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))  # imported by whomever
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: False, raising=False)
+    assert progress_module.on_terminal() == notebook
 
 
 # ---- the example for robots ----------------------------------------------------------------------------

@@ -127,8 +127,15 @@ class _LogLines:
 
 def on_terminal() -> bool:
     """Whether stderr is shown to somebody on a terminal that can redraw a line, or in a notebook."""
-    notebook = "ipykernel" in sys.modules
-    return notebook or (sys.stderr.isatty() and os.environ.get("TERM") != "dumb")
+    return _in_notebook() or (sys.stderr.isatty() and os.environ.get("TERM") != "dumb")
+
+
+def _in_notebook() -> bool:
+    """Whether a notebook's kernel runs this program; that the package of kernels was imported says nothing."""
+    if "ipykernel" not in sys.modules or "IPython" not in sys.modules:
+        return False
+    shell = sys.modules["IPython"].get_ipython()
+    return shell is not None and hasattr(shell, "kernel")
 
 
 def rich_progress(*columns: Any) -> Any:

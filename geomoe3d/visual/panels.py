@@ -20,7 +20,6 @@ from geomoe3d.visual.drawing import (
     choose_rows,
 )
 from geomoe3d.visual.paper import (
-    FAINT,
     INK,
     LABEL_BOX,
     SIDES,
@@ -28,6 +27,7 @@ from geomoe3d.visual.paper import (
     bounds,
     frame,
     number,
+    plain_axes,
     say,
     shorten,
     show,
@@ -163,10 +163,7 @@ def draw_residuals(axes: Axes, view: RegistrationView) -> None:
         color=SOFT,
     )
     axes.set_ylabel("correspondences", fontsize=9.5, color=SOFT)
-    axes.tick_params(labelsize=9, colors=SOFT)
-    for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(FAINT)
+    plain_axes(axes, 9)
 
 
 def draw_facts(axes: Axes, view: RegistrationView) -> None:

@@ -75,3 +75,11 @@ def shorten(text: str, most: int) -> str:
         return text
     tail = most // 2
     return text[: most - tail - 1] + "…" + text[-tail:]
+
+
+def plain_axes(axes: Axes, size: float) -> None:
+    """Ticks in small soft print, lines at the left and below alone."""
+    axes.tick_params(labelsize=size, colors=SOFT)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(FAINT)

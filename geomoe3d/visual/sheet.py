@@ -27,7 +27,7 @@ from geomoe3d.visual.drawing import (
     distance_to_target,
 )
 from geomoe3d.visual.page import distance_limit, distance_reach
-from geomoe3d.visual.paper import FAINT, INK, SOFT, number, shorten
+from geomoe3d.visual.paper import FAINT, INK, SOFT, number, plain_axes, shorten
 from geomoe3d.visual.picture import MAX_POINTS, draw_absent, draw_sides
 from geomoe3d.visual.view import RegistrationView
 
@@ -148,10 +148,7 @@ def _draw_distances(axes: Axes, view: RegistrationView, drawing: Drawing, motion
         color=SOFT,
     )
     axes.set_ylabel("source points drawn", fontsize=7.5, color=SOFT)
-    axes.tick_params(labelsize=7.5, colors=SOFT)
-    for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(FAINT)
+    plain_axes(axes, 7.5)
 
 
 def _title(view: RegistrationView) -> str:

@@ -131,7 +131,8 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 def test_numpy_gives_what_torch_gives(pair) -> None:
     torch = pytest.importorskip("torch")
-    from geomoe3d.training.descriptor_network import DescriptorNetwork, View
+    from geomoe3d.training.descriptor_network import DescriptorNetwork
+    from geomoe3d.training.descriptor_views import View
 
     network = DescriptorNetwork().eval()
     network.load_state_dict({k: torch.from_numpy(v) for k, v in load_tensors(WEIGHTS).items()})
@@ -150,7 +151,13 @@ def shards(tmp_path_factory, pair) -> Path:
     from geomoe3d.data.shards import DescribedScene, write_shard
 
     source, target, T = pair
-    points = [cloud.points.astype(np.float32) for cloud in (source, target)]
+    # What both see, and less of the rest: training on a processor is slow.
+    near = transform_points(T, source.points)
+    kept = cKDTree(target.points).query(near)[0] < 0.1, cKDTree(near).query(target.points)[0] < 0.1
+    points = [
+        cloud.points[rows][:1200].astype(np.float32)
+        for cloud, rows in zip((source, target), kept, strict=True)
+    ]
     count = sum(map(len, points))
     scene = DescribedScene(
         "room",
@@ -167,16 +174,63 @@ def shards(tmp_path_factory, pair) -> Path:
     return folder
 
 
+def test_surfaces_in_torch_are_those_of_registration(pair) -> None:
+    torch = pytest.importorskip("torch")
+    from geomoe3d.training.torch_surface import fpfh, plane_normals
+
+    cloud = pair[0]
+    points = torch.from_numpy(((cloud.points - cloud.points.mean(0)) / cloud.voxel_size).astype(np.float32))
+    normals = torch.from_numpy(cloud.normals.astype(np.float32))
+    config = PreparationConfig()
+    cosine = (plane_normals(points, config.normal_radius, config.normal_neighbors) * normals).sum(1).abs()
+    assert float(cosine.min()) > 0.999
+    apart = np.linalg.norm(fpfh(points, normals, 5.0, 100).numpy() - FpfhDescriptor()(cloud), axis=1)
+    assert np.quantile(apart, 0.98) < 1e-3 and apart.max() < 0.1  # rounding moves single votes
+
+
+def test_relations_in_torch_are_those_of_registration(pair) -> None:
+    torch = pytest.importorskip("torch")
+    from geomoe3d.training.descriptor_views import Grid, torch_relations
+
+    fine, middle, _ = pyramid(pair[0])
+    at = fine.take(np.arange(200))
+    _, rows = nearest(at, middle, 16)
+    grids = [
+        Grid(*map(torch.from_numpy, (level.points, level.normals, level.features)), level.edge)
+        for level in (at, middle)
+    ]
+    found = torch_relations(grids[0], grids[1], torch.from_numpy(rows)).numpy()
+    assert np.allclose(found, relations(at, middle, rows), atol=1e-5)
+
+
+def test_a_batch_of_views_is_each_of_them(shards: Path) -> None:
+    torch = pytest.importorskip("torch")
+    from geomoe3d.training.descriptor_network import DescriptorNetwork
+    from geomoe3d.training.descriptor_pairs import ContrastPairs
+    from geomoe3d.training.descriptor_views import batch_view
+
+    pairs = ContrastPairs([str(shards)], variants=3)
+    fragments = [f for index in range(2) for k in range(3) if (f := pairs._fragment(0, index, k)) is not None]
+    assert len(fragments) == 6
+    network = DescriptorNetwork().eval()
+    queries = [torch.arange(5 + k) for k in range(6)]
+    with torch.no_grad():
+        together = network(batch_view(fragments, queries))
+        alone = [network(batch_view([f], [q])) for f, q in zip(fragments, queries, strict=True)]
+    assert torch.allclose(together, torch.cat(alone), atol=1e-5)
+
+
 def test_shared_points_of_a_drawn_pair_are_the_same_places(shards: Path) -> None:
+    torch = pytest.importorskip("torch")
     from geomoe3d.training.descriptor_pairs import ContrastPairs
 
-    drawn = ContrastPairs([str(shards)], num_shared=50, num_random=70)[4]
-    again = ContrastPairs([str(shards)], num_shared=50, num_random=70)[4]
-    for side in range(2):
-        m, apart = drawn.num_shared, drawn.apart[side]
-        assert apart.shape == (m, len(drawn.queries[1 - side]))
-        assert (np.diagonal(apart[:, :m]) < 0.9).all()
-        assert np.array_equal(drawn.queries[side], again.queries[side])
+    drawn, again, other = (
+        ContrastPairs([str(shards)], seed, num_shared=50, num_random=70).batch(4, 3) for seed in (0, 0, 1)
+    )
+    assert drawn.apart.shape == (6, 50, 120)
+    assert float(drawn.apart.diagonal(dim1=1, dim2=2).max()) < 0.9
+    assert torch.equal(drawn.apart, again.apart) and not torch.equal(drawn.apart, other.apart)
+    assert torch.equal(drawn.view.given[0], again.view.given[0])
 
 
 @pytest.mark.usefixtures("one_thread")

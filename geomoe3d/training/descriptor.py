@@ -22,14 +22,17 @@ from torch import Tensor
 
 from geomoe3d.config import Section
 from geomoe3d.errors import CheckpointError, OutputError
+from geomoe3d.features.learned import LEARNED
 from geomoe3d.runtime.files import write_atomically, write_text
-from geomoe3d.training.descriptor_network import WIDTH, DescriptorNetwork, View
-from geomoe3d.training.descriptor_pairs import ContrastPair, ContrastPairs
+from geomoe3d.training.descriptor_network import WIDTH, DescriptorNetwork
+from geomoe3d.training.descriptor_pairs import ContrastBatch, ContrastPairs
+from geomoe3d.training.distributed import Process, choose_device
 
 _RIGHT = 2.0  # voxels: a match so near is right, as in registration
 _WRONG = 3.0  # voxels: one farther off is wrong; those between count as neither
 _NEVER = -1e4
 _AVERAGE_DECAY = 0.995
+_FREE_KEYS = {"device", "save_every"}  # may differ when a run goes on
 
 
 class DescriptorTrainConfig(Section):
@@ -39,6 +42,8 @@ class DescriptorTrainConfig(Section):
     seed: int = Field(0, ge=0)
     steps: int = Field(8000, ge=1, description="updates of the weights")
     batch_size: int = Field(2, ge=1, description="pairs per step")
+    device: str = Field("auto", description="auto, cpu, cuda, cuda:1")
+    variants: int = Field(2, ge=1, description="of each fragment: as it is, and with noise and thinned")
     width: int = Field(WIDTH, ge=4, description="channels")
     learning_rate: float = Field(2e-3, gt=0, description="the largest of the schedule")
     weight_decay: float = Field(1e-3, ge=0)
@@ -49,16 +54,14 @@ class DescriptorTrainConfig(Section):
     save_every: int = Field(250, ge=1, description="steps")
 
 
-def contrast(
-    features: tuple[Tensor, Tensor], apart: tuple[Tensor, Tensor], scale: Tensor
-) -> tuple[Tensor, float]:
+def contrast(features: Tensor, apart: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     """How far the shared points are from finding each other among all points asked, and how many do.
 
-    -log of the softmax weight of all that is right, against all that is wrong, mean over both directions.
+    -log of the softmax weight of all that is right, against all that is wrong, mean over all of them.
 
     Args:
-        features: (q, D) of source and target, unit length.
-        apart: see `ContrastPair`.
+        features: (2 P, q, D) of P pairs, source and target in turn, unit length.
+        apart: (2 P, m, q), see `ContrastBatch`.
         scale: similarity counts so many times.
 
     Returns:
@@ -66,15 +69,13 @@ def contrast(
 
     Source: the loss of contrastive predictive coding (van den Oord et al., 2018) with several right answers.
     """
-    losses, found = [], []
-    for a, b, distance in ((*features, apart[0]), (features[1], features[0], apart[1])):
-        logit = scale * a[: len(distance)] @ b.T
-        right = logit.masked_fill(distance > _RIGHT, _NEVER).logsumexp(1)
-        wrong = logit.masked_fill(distance < _WRONG, _NEVER).logsumexp(1)
-        losses.append((torch.logaddexp(right, wrong) - right).mean())
-        best = distance.gather(1, logit.detach().argmax(1, keepdim=True))
-        found.append(float((best <= _RIGHT).float().mean()))
-    return torch.stack(losses).mean(), sum(found) / 2
+    pairs, q, width = features.shape
+    other = features.view(pairs // 2, 2, q, width).flip(1).flatten(0, 1)
+    logit = scale * features[:, : apart.shape[1]] @ other.transpose(1, 2)
+    right = logit.masked_fill(apart > _RIGHT, _NEVER).logsumexp(2)
+    wrong = logit.masked_fill(apart < _WRONG, _NEVER).logsumexp(2)
+    best = apart.gather(2, logit.detach().argmax(2, keepdim=True))
+    return (torch.logaddexp(right, wrong) - right).mean(), (best <= _RIGHT).float().mean()
 
 
 class DescriptorRun:
@@ -96,10 +97,11 @@ class DescriptorRun:
         except OSError as error:
             raise OutputError(f"cannot use '{folder}' as run folder: {error.strerror}") from None
         torch.manual_seed(config.seed)
-        self.network = DescriptorNetwork(config.width)
-        self.averaged = DescriptorNetwork(config.width).requires_grad_(False)
+        self.device = choose_device(config.device, Process())
+        self.network = DescriptorNetwork(config.width).to(self.device)
+        self.averaged = DescriptorNetwork(config.width).to(self.device).requires_grad_(False)
         self.averaged.load_state_dict(self.network.state_dict())
-        self.log_scale = torch.nn.Parameter(torch.tensor(2.7))
+        self.log_scale = torch.nn.Parameter(torch.tensor(2.7, device=self.device))
         self.optimizer = torch.optim.AdamW(
             [*self.network.parameters(), self.log_scale],
             lr=config.learning_rate,
@@ -123,54 +125,56 @@ class DescriptorRun:
         """To the end of the schedule, then the weights' path; or to step ``until``, then None."""
         config = self.config
         pairs = self._pairs(config.seed, config.leave_out)
-        losses: list[tuple[float, float]] = []
+        validation = self._pairs(config.seed + 1, -config.leave_out) if config.leave_out else None
+        sums = torch.zeros(2, device=self.device)
+        since = self.step
         last = min(until or config.steps, config.steps)
         while self.step < last:
-            first = self.step * config.batch_size
-            losses.append(self._update([pairs[first + k] for k in range(config.batch_size)]))
+            sums += self._update(pairs.batch(self.step, config.batch_size))
             if self.step % config.save_every == 0 or self.step == last:
                 self._save()
-                loss, share = (sum(column) / len(losses) for column in zip(*losses, strict=True))
-                losses = []
-                line = f"{self.step},{loss:.4f},{share:.4f},{self.validate():.4f},{time.time():.0f}"
+                loss, share = (sums / (self.step - since)).tolist()
+                sums, since = torch.zeros_like(sums), self.step
+                found = math.nan if validation is None else self.validate(validation)
+                line = f"{self.step},{loss:.4f},{share:.4f},{found:.4f},{time.time():.0f}"
                 with (self.folder / "log.csv").open("a") as log:
                     log.write(line + "\n")
                 report(f"step, loss, found, found in validation, time: {line}")
         return self._finish() if self.step == config.steps else None
 
     @torch.no_grad()
-    def validate(self) -> float:
-        """Share of shared points found, averaged weights, scenes left out; NaN where none is."""
-        config = self.config
-        if config.leave_out == 0:
-            return math.nan
-        pairs = self._pairs(config.seed + 1, -config.leave_out)
-        found = [_loss(self.averaged, pairs[k], self.log_scale)[1] for k in range(config.validation_pairs)]
-        return sum(found) / len(found)
+    def validate(self, pairs: ContrastPairs) -> float:
+        """Share of shared points found by the averaged weights in pairs of scenes left out."""
+        found = [self._loss(self.averaged, pairs.batch(k, 1))[1] for k in range(self.config.validation_pairs)]
+        return float(torch.stack(found).mean())
 
     def _pairs(self, seed: int, leave_out: int) -> ContrastPairs:
         config = self.config
         counts = {"num_shared": config.num_shared, "num_random": config.num_random}
-        return ContrastPairs(list(config.data), seed, leave_out=leave_out, **counts)
+        variants = config.variants if leave_out >= 0 else 1
+        return ContrastPairs(
+            list(config.data), seed, self.device, leave_out=leave_out, variants=variants, **counts
+        )
 
-    def _update(self, batch: list[ContrastPair]) -> tuple[float, float]:
-        """One step; mean loss and share found."""
+    def _update(self, batch: ContrastBatch) -> Tensor:
+        """One step; loss and share found."""
         done = self.step / self.config.steps
         rate = min(1.0, (self.step + 1) / 100) * (0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * done)))
         for group in self.optimizer.param_groups:
             group["lr"] = rate * self.config.learning_rate
         self.optimizer.zero_grad()
-        measures = []
-        for pair in batch:
-            loss, share = _loss(self.network, pair, self.log_scale)
-            torch.autograd.backward(loss / len(batch))
-            measures.append((float(loss.detach()), share))
+        loss, share = self._loss(self.network, batch)
+        torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
         keep = min(_AVERAGE_DECAY, self.step / (self.step + 50))
         torch._foreach_lerp_(list(self.averaged.parameters()), list(self.network.parameters()), 1 - keep)
         self.step += 1
-        return sum(m[0] for m in measures) / len(batch), sum(m[1] for m in measures) / len(batch)
+        return torch.stack([loss.detach(), share])
+
+    def _loss(self, network: DescriptorNetwork, batch: ContrastBatch) -> tuple[Tensor, Tensor]:
+        features = network(batch.view).view(len(batch.apart), -1, LEARNED)
+        return contrast(features, batch.apart, self.log_scale.exp())
 
     def _save(self) -> None:
         state: dict[str, Any] = {
@@ -185,11 +189,11 @@ class DescriptorRun:
 
     def _resume(self) -> None:
         try:
-            state = torch.load(self.last_path, weights_only=True)
+            state = torch.load(self.last_path, map_location=self.device, weights_only=True)
             before = DescriptorTrainConfig.model_validate_json(state["config"])
         except Exception as error:  # torch names no common class for what a damaged file raises
             raise CheckpointError(f"checkpoint '{self.last_path}' cannot be read: {error}") from None
-        if before != self.config:
+        if before.model_dump(exclude=_FREE_KEYS) != self.config.model_dump(exclude=_FREE_KEYS):
             raise CheckpointError(
                 f"'{self.last_path}' was made with other settings: {before.model_dump_json()}; set them "
                 "back, or train into another folder"
@@ -211,12 +215,5 @@ def save_tensors(network: DescriptorNetwork, path: Path) -> None:
     """Write the weights in half precision, as `features.learned` reads them; an old file is replaced."""
     from safetensors.torch import save_file
 
-    tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    tensors = {name: tensor.half().cpu().contiguous() for name, tensor in network.state_dict().items()}
     write_atomically(path, lambda temporary: save_file(tensors, temporary), force=True)
-
-
-def _loss(network: DescriptorNetwork, pair: ContrastPair, log_scale: Tensor) -> tuple[Tensor, float]:
-    views = (View.of(levels, rows) for levels, rows in zip(pair.levels, pair.queries, strict=True))
-    source, target = (network(view) for view in views)
-    apart = torch.from_numpy(pair.apart[0]), torch.from_numpy(pair.apart[1])
-    return contrast((source, target), apart, log_scale.exp())

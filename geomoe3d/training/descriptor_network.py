@@ -7,57 +7,16 @@ same names. Training needs features at a few hundred points of a cloud only, hen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
-from geomoe3d.features.learned import LEARNED, NUM_NEIGHBORS
-from geomoe3d.features.pyramid import NUM_RELATIONS, Level, nearest, relations
-from geomoe3d.types import IntArray
+from geomoe3d.features.learned import LEARNED
+from geomoe3d.features.pyramid import NUM_RELATIONS
+from geomoe3d.training.descriptor_views import LOOKS, View
 
 WIDTH = 64
 _FPFH = 33
 _INPUT_SCALE = 4.0  # FPFH of length 1 is small beside the biases a layer starts with
-LOOKS = {
-    "middle_middle": (1, 1),
-    "coarse_middle": (2, 1),
-    "coarse_coarse": (2, 2),
-    "fine_middle": (0, 1),
-    "fine_coarse": (0, 2),
-}
-"""Which level looks at which, in the order of evaluation."""
-
-
-@dataclass(frozen=True)
-class View:
-    """What the network is shown of one cloud.
-
-    Attributes:
-        given: of the queries, the middle and the coarse level, what each point begins with.
-        rows: by look, (m, k) neighbours.
-        lie: by look, (m, k, 8) how they lie.
-    """
-
-    given: tuple[Tensor, ...]
-    rows: dict[str, Tensor]
-    lie: dict[str, Tensor]
-
-    @classmethod
-    def of(cls, levels: tuple[Level, ...], queries: IntArray) -> View:
-        """Of a pyramid, with features wanted at these rows of its finest level."""
-        fine, middle, coarse = levels
-        asked = (fine.take(queries), middle, coarse)
-        given = [torch.from_numpy(asked[0].features)]
-        for level in (middle, coarse):
-            both = torch.from_numpy(fine.features[level.rows]), torch.from_numpy(level.features)
-            given.append(torch.cat(both, 1))
-        rows, lie = {}, {}
-        for name, (at, of) in LOOKS.items():
-            _, near = nearest(asked[at], levels[of], NUM_NEIGHBORS)
-            rows[name] = torch.from_numpy(near)
-            lie[name] = torch.from_numpy(relations(asked[at], levels[of], near))
-        return cls(tuple(given), rows, lie)
 
 
 class Look(nn.Module):

@@ -132,7 +132,7 @@ def training(repeats: int, clock: Callable[[], float]) -> None:
 
 def training_step(size: int, num: int) -> tuple[Callable[[], None], int]:
     """One full step (forward, losses, backward, update) of the faithful configuration on made-up pairs."""
-    from geomoe3d.training.batches import TrainingSamples, make_batch, open_training
+    from geomoe3d.training.batches import first_batch
     from geomoe3d.training.config import TrainConfig
     from geomoe3d.training.step import Updater
     from geomoe3d.training.synthetic import SyntheticConfig
@@ -142,8 +142,7 @@ def training_step(size: int, num: int) -> tuple[Callable[[], None], int]:
         update={"correspondences": num, "synthetic": SyntheticConfig(correspondences=(num, num))}
     )
     config = config.model_copy(update={"data": data})
-    samples = TrainingSamples(open_training(config), config)
-    batch = make_batch([samples[i] for i in range(size)])
+    batch = first_batch(config)
     model = GeoMoE().train()
     updater = Updater(model, model, torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True), config)
 

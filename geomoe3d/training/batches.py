@@ -8,7 +8,7 @@ process r as its micro-batch m, so two processes do what one does with twice the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import rotation_error_deg
+from geomoe3d.images.generate import ImagePairsConfig, generate_matches, neighbors_of
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.inputs import BatchInput, PairInput, collate, pair_input, under_motions
 from geomoe3d.networks.motion_inputs import MotionInputs
@@ -94,8 +95,10 @@ def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
     return ShardFolder(where)
 
 
-def open_training(config: TrainConfig) -> PairDataset:
+def open_training(config: TrainConfig) -> PairDataset | ImagePairs:
     """Training pairs of a run."""
+    if config.network.correspondence_dim == 4:
+        return ImagePairs(config.data.images, config.network, config.seed)
     return open_pairs(config.data.train, config.data, config.seed)
 
 
@@ -247,12 +250,46 @@ class StepSampler(Sampler[list[int]]):
         return (self.config.steps - self.first_step) * self.config.accumulation
 
 
+class ImagePairs:
+    """Generated matches of two images, a whole batch at a time, on the device that trains.
+
+    A batch depends on seed and number, and on the kind of device: GPUs draw other numbers than processors.
+    """
+
+    def __init__(self, config: ImagePairsConfig, network: NetworkConfig, seed: int) -> None:
+        self.config, self.network, self.seed = config, network, seed
+
+    def batch(self, size: int, number: int, device: torch.device | str = "cpu") -> Batch:
+        """Batch ``number`` of ``size`` pairs."""
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1, np.uint64)[0] >> 1)
+        drawn = generate_matches(self.config, size, seed, device)
+        neighbors = neighbors_of(drawn.matches, self.network.num_neighbors)
+        inputs = BatchInput(drawn.matches, None, neighbors, None)
+        return Batch(inputs, drawn.labels, drawn.truth, None, torch.arange(size, device=device))
+
+    def identity(self) -> str:
+        """Seed and settings."""
+        return f"images:1:{self.seed}:{self.config.model_dump_json()}"
+
+    def voxel_sizes(self) -> tuple[float, float]:
+        """One focal length: image points have no voxels."""
+        return 1.0, 1.0
+
+
 def training_loader(
-    config: TrainConfig, pairs: PairDataset, first_step: int, rank: int = 0, world: int = 1
-) -> DataLoader[Batch]:
-    """Batches from ``first_step`` on."""
+    config: TrainConfig,
+    pairs: PairDataset | ImagePairs,
+    first_step: int,
+    rank: int = 0,
+    world: int = 1,
+    device: torch.device | str = "cpu",
+) -> Iterable[Batch]:
+    """Batches from ``first_step`` on; those of images are drawn on ``device``."""
+    if isinstance(pairs, ImagePairs):
+        blocks = StepSampler(config, first_step, rank, world)
+        return (pairs.batch(len(block), block[0] // len(block), device) for block in blocks)
     return DataLoader(
-        TrainingSamples(pairs, config),  # type: ignore[arg-type]
+        TrainingSamples(pairs, config),
         batch_sampler=StepSampler(config, first_step, rank, world),
         num_workers=config.workers,
         collate_fn=make_batch,
@@ -261,8 +298,16 @@ def training_loader(
     )
 
 
+def first_batch(config: TrainConfig) -> Batch:
+    """The batch of a run's first step, made in this process."""
+    alone = config.model_copy(update={"workers": 0})
+    return next(iter(training_loader(alone, open_training(alone), 0)))
+
+
 def validation_samples(config: TrainConfig) -> list[Sample]:
     """The first pairs of the validation set, not augmented but cut to the training length, seeded."""
+    if config.network.correspondence_dim == 4:
+        return _image_samples(config)
     pairs = open_validation(config)
     samples = []
     for index in range(min(config.validation.num_pairs, len(pairs))):
@@ -271,6 +316,16 @@ def validation_samples(config: TrainConfig) -> list[Sample]:
         if rows is not None and len(pair) > rows:
             pair = pair.take(np.random.default_rng([5, index]).permutation(len(pair))[:rows])
         samples.append(make_sample(pair, config.network, config.data))
+    return samples
+
+
+def _image_samples(config: TrainConfig) -> list[Sample]:
+    pairs = ImagePairs(config.data.images, config.network, _VALIDATION_SEED)
+    samples = []
+    for number in range(config.validation.num_pairs):
+        one = pairs.batch(1, number)
+        inputs = PairInput(one.input.coordinates[0], None, one.input.neighbors[0])
+        samples.append(Sample((inputs,), one.labels[0], one.truth[0]))
     return samples
 
 

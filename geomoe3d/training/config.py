@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from geomoe3d.config import Section, build_config, read_yaml, set_keys
 from geomoe3d.data.draw import DrawSettings
+from geomoe3d.images.generate import ImagePairsConfig
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.training.augment import AugmentationConfig
 from geomoe3d.training.losses import LossConfig
@@ -25,7 +26,9 @@ FREE_KEYS = ("logging", "validation", "checkpoint_every", "workers", "data.prefe
 class DataConfig(Section):
     """Where pairs come from."""
 
-    train: str = Field("synthetic", description="synthetic, or a folder of shards")
+    train: str = Field(
+        "synthetic", description="synthetic, or a folder of shards; of networks with 4D input, see `images`"
+    )
     validation: str = Field("synthetic", description="synthetic (other rooms), or a folder of shards")
     correspondences: int | None = Field(1000, ge=3, description="most per training pair; None: all")
     motions_per_pair: int = Field(
@@ -36,6 +39,9 @@ class DataConfig(Section):
     )
     prefetch: int = Field(4, ge=1, description="batches that each worker prepares ahead")
     synthetic: SyntheticConfig = SyntheticConfig()
+    images: ImagePairsConfig = Field(
+        ImagePairsConfig(), description="generated matches of two images, for networks with 4D input"
+    )
     draw: DrawSettings = Field(
         DrawSettings(), description="which pairs of described fragments are drawn, and how"
     )
@@ -104,6 +110,13 @@ class TrainConfig(Section):
             raise ValueError(
                 "a network that judges motions is trained with data.augmentation.rotate=false, swap=0 and "
                 "jitter=0: its channels do not change with rotation, and the others would not fit the motions"
+            )
+        if (
+            self.network.correspondence_dim == 4
+            and (self.data.train, self.data.validation) != ("synthetic",) * 2
+        ):
+            raise ValueError(
+                "a network with 4D input learns from generated image matches: data.train=synthetic"
             )
         if self.checkpoint_activations and self.network.kind != "geomoe":
             raise ValueError(

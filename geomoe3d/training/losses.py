@@ -17,6 +17,13 @@ from torch import Tensor
 
 from geomoe3d.config import Section
 from geomoe3d.geometry.kabsch import weighted_kabsch
+from geomoe3d.images.epipolar import (
+    MIN_MATCHES,
+    essential_of,
+    symmetric_distance,
+    virtual_matches,
+    weighted_eight_point,
+)
 from geomoe3d.networks.geomoe import GeoMoEOutput
 from geomoe3d.networks.layers import weights_from_logits
 
@@ -34,7 +41,9 @@ class LossConfig(Section):
     regression_margin: float = Field(
         1.0, gt=0, description="squared network units (1 unit: 20 voxels), 1 m^2 at 5 cm voxels"
     )
-    virtual_points: int = Field(4, ge=2, description="per edge of the lattice in the source's box")
+    virtual_points: int = Field(
+        4, ge=2, description="per edge of the lattice in the source's box, or of the grid over an image"
+    )
     balance_weight: float = Field(0.01, ge=0)
     classification_form: Literal["balanced", "plain"] = Field(
         "balanced", description="inliers and outliers weigh half each, as published, or by inlier_weight"
@@ -177,7 +186,35 @@ def regression_loss(
     # Differences of the motions, so that nothing cancels.
     D = fit.T_target_source - truth.float()
     offset = virtual.float() @ D[..., :3, :3].transpose(-1, -2) + D[..., None, :3, 3]
-    square = offset.square().sum(-1)
+    return _mean_cost(offset.square().sum(-1), solved, config)
+
+
+def epipolar_loss(
+    logits: Tensor, coordinates: Tensor, truth: Tensor, config: LossConfig
+) -> tuple[Tensor, Tensor]:
+    """How far matches that fit the true pose lie from the epipolar lines of the weighted eight-point solution.
+
+    Args:
+        logits: (L, B, N), 0 or less at padding.
+        coordinates: (B, N, 4), normalised by the intrinsics.
+        truth: (B, 4, 4) pose X1 = R X0 + t.
+        config: form and margin of the squared distances, and how many virtual matches.
+
+    Returns:
+        As `regression_loss`.
+
+    Source:
+        The geometric loss of OANet (Zhang et al., ICCV 2019), with `virtual_matches` in place of its own.
+    """
+    weights = weights_from_logits(logits.float())
+    fit = weighted_eight_point(coordinates.float(), weights)
+    virtual = virtual_matches(essential_of(truth.double()), config.virtual_points)
+    solved = fit.valid & ((weights > 0).sum(-1) >= MIN_MATCHES)
+    return _mean_cost(symmetric_distance(fit.E, virtual), solved, config)
+
+
+def _mean_cost(square: Tensor, solved: Tensor, config: LossConfig) -> tuple[Tensor, Tensor]:
+    """Squared distances (L, B, V) to a cost (L,), and how many of ``solved`` (L, B) are not."""
     margin = config.regression_margin
     if config.regression_form == "clamp":
         cost = square.clamp(max=margin)
@@ -237,8 +274,11 @@ def total_loss(
     regression = classification.new_zeros(())
     unsolved = torch.zeros((), dtype=torch.int64, device=classification.device)
     if config.regression_weight > 0 and progress >= config.regression_warmup:
-        virtual = virtual_lattice(coordinates, mask, config.virtual_points)
-        per_layer, unsolved = regression_loss(output.logits, coordinates, truth, virtual, config)
+        if coordinates.shape[-1] == 4:
+            per_layer, unsolved = epipolar_loss(output.logits, coordinates, truth, config)
+        else:
+            virtual = virtual_lattice(coordinates, mask, config.virtual_points)
+            per_layer, unsolved = regression_loss(output.logits, coordinates, truth, virtual, config)
         regression = per_layer.sum()
     total = classification + config.regression_weight * regression + config.balance_weight * output.balance
     verdict = classification.new_zeros(())

@@ -1,7 +1,8 @@
 """How well a network does on labelled pairs: labels by precision, recall and F1, motions by recall.
 
 A motion counts as found under 15 degrees and 6 voxels (30 cm at 5 cm voxels), by weighted Kabsch on the
-last layer's weights alone. Means are over pairs; an undefined precision or recall counts 0.
+last layer's weights alone; a pose of two images under 10 degrees of rotation and of direction, by the weighted
+eight-point algorithm. Means are over pairs; an undefined precision or recall counts 0.
 """
 
 from __future__ import annotations
@@ -10,9 +11,12 @@ import torch
 from torch import Tensor
 
 from geomoe3d.geometry.kabsch import weighted_kabsch
+from geomoe3d.images.epipolar import decompose, pose_errors_deg, weighted_eight_point
 from geomoe3d.networks.build import Network
 from geomoe3d.networks.layers import weights_from_logits
 from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch
+
+MAX_POSE_ERROR_DEG = 10.0
 
 
 def label_measures(logits: Tensor, labels: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
@@ -44,11 +48,24 @@ def motion_found(logits: Tensor, coordinates: Tensor, truth: Tensor, unit_voxels
     return found
 
 
+def pose_found(logits: Tensor, matches: Tensor, truth: Tensor) -> Tensor:
+    """(B,) bool: the weighted eight-point pose of matches (B, N, 4) lies within ten degrees of the truth."""
+    weights = weights_from_logits(logits)
+    fit = weighted_eight_point(matches, weights)
+    errors = torch.stack(pose_errors_deg(decompose(fit.E, matches, weights), truth))
+    found: Tensor = fit.valid & (errors.amax(0) < MAX_POSE_ERROR_DEG)
+    return found
+
+
 @torch.no_grad()
 def measure_batch(logits: Tensor, batch: Batch, unit_voxels: float) -> dict[str, Tensor]:
     """(B,) of each measure for the last layer's logits (B, N)."""
     measures = label_measures(logits, batch.labels, batch.input.mask)
-    found = motion_found(logits, batch.input.coordinates, batch.truth, unit_voxels)
+    points = batch.input.coordinates
+    if points.shape[-1] == 4:
+        found = pose_found(logits, points, batch.truth)
+    else:
+        found = motion_found(logits, points, batch.truth, unit_voxels)
     return {**measures, "registration_recall": found.double()}
 
 

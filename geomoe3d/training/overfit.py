@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 
 from geomoe3d.networks.build import build_network
-from geomoe3d.training.batches import TrainingSamples, make_batch, open_training
+from geomoe3d.training.batches import first_batch
 from geomoe3d.training.config import TrainConfig
 from geomoe3d.training.distributed import Process, choose_device
 from geomoe3d.training.step import Updater
@@ -33,8 +33,7 @@ def overfit_one_batch(
     """
     device = choose_device(config.device, Process())
     torch.manual_seed(config.seed)
-    samples = TrainingSamples(open_training(config), config)
-    batch = make_batch([samples[i] for i in range(config.batch_size)])
+    batch = first_batch(config)
     model = build_network(config.network).to(device).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.0)
     updater = Updater(model, model, optimizer, config.model_copy(update={"accumulation": 1}))

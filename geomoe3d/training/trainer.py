@@ -116,7 +116,9 @@ class TrainingRun:
         if self.process.world > 1:
             wrapped = DistributedDataParallel(self.model)
         updater = Updater(self.model, wrapped, self.optimizer, config)
-        loader = training_loader(config, self.pairs, progress.step, self.process.rank, self.process.world)
+        loader = training_loader(
+            config, self.pairs, progress.step, self.process.rank, self.process.world, self.device
+        )
         batches: Iterator[Batch] = iter(loader)
         logs = RunLogs(self.folder, config, progress.step) if self.process.is_first else None
         if logs is not None and logs.board.missing:

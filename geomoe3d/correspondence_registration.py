@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.clouds.viewpoint import believed_viewpoints
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.config import RegistrationConfig, expert, expert_in_force
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
@@ -26,15 +26,6 @@ from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
 from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray, Hypothesis, PreparedCloud
-
-MOST_LOOKED_AT = 6
-"""Hypotheses that a network looks at."""
-FIRST_LOOKED_AT = 2
-"""Hypotheses that it looks at before it is asked whether it has seen enough."""
-CONVINCED = 3.0
-"""Verdict from which on no further hypotheses are looked at."""
-MOST_ROWS = 1000
-"""Correspondences that a hypothesis is scored on; mutual ones first where there are more."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +81,11 @@ class CorrespondenceRegistrar:
         self.pipeline = Pipeline(resolved(config))
         self.pipeline.warm_up()
 
+    @property
+    def config(self) -> RegistrationConfig:
+        """That of the parts."""
+        return self.pipeline.config
+
     @classmethod
     def of(cls, pipeline: Pipeline) -> CorrespondenceRegistrar:
         """With parts that somebody has made already."""
@@ -97,6 +93,7 @@ class CorrespondenceRegistrar:
         made.pipeline = pipeline
         return made
 
+    @expert_in_force
     def __call__(
         self,
         correspondences: ArrayLike | Correspondences,
@@ -113,7 +110,7 @@ class CorrespondenceRegistrar:
             inlier_threshold: cloud units; None takes that of the configuration.
             seed: None takes that of the configuration.
         """
-        config, clock = self.pipeline.config, StageClock()
+        config, clock = self.config, StageClock()
         rows = check_rows(correspondences)
         voxel_size = check_length(voxel_size, "voxel_size")
         threshold = config.estimator.inlier_threshold * voxel_size
@@ -136,9 +133,10 @@ class CorrespondenceRegistrar:
         motions = [shift_frames(hypothesis.T_target_source, *origins) for hypothesis in found]
         return CorrespondenceResult(motions[0], inliers, threshold, weighed, tuple(motions[1:]), seconds)
 
+    @expert_in_force
     def weigh(self, correspondences: ArrayLike | Correspondences, voxel_size: float) -> FilterOutput:
         """What the outlier filter, or a network under the best transform, says of correspondences (N, 6)."""
-        config = self.pipeline.config
+        config = self.config
         rows, voxel_size = check_rows(correspondences), check_length(voxel_size, "voxel_size")
         matched = localised(rows)[0] if len(rows) else Correspondences(rows)
         pair = Pair(matched, voxel_size, config.estimator.inlier_threshold * voxel_size, config.seed)
@@ -146,6 +144,7 @@ class CorrespondenceRegistrar:
             return self.hypotheses(pair, StageClock())[1]
         return self.pipeline.weigh(pair)
 
+    @expert_in_force
     @single_blas_thread()
     def hypotheses(self, pair: Pair, clock: StageClock) -> tuple[list[Hypothesis], FilterOutput]:
         """Best first, and weights of the correspondences: of the filter, or of the network under the best."""
@@ -165,13 +164,14 @@ class CorrespondenceRegistrar:
         if not found:
             return [], FilterOutput(np.zeros(len(matched)))
         clock("score")
-        few = likeliest_rows(matched, MOST_ROWS, pair.inlier_threshold, pair.seed)
+        known = expert().correspondences
+        few = likeliest_rows(matched, known.most_rows, pair.inlier_threshold, pair.seed)
         surfaces = pair.keypoint_surfaces if few is matched else None
         aligner = KeypointAligner(matched.points, pair.inlier_threshold, surfaces)
         say = network.about(pair if few is matched else replace(pair, matched=few))
         looked_at: list[Hypothesis] = []
-        for lot in (found[:FIRST_LOOKED_AT], found[FIRST_LOOKED_AT:MOST_LOOKED_AT]):
-            if lot and all(_verdict(h) < CONVINCED for h in looked_at):
+        for lot in (found[: known.first_looked_at], found[known.first_looked_at : known.most_looked_at]):
+            if lot and all(_verdict(h) < known.convinced for h in looked_at):
                 count = max(num_aligned - len(looked_at), 0)
                 lot = aligner.hypotheses(lot[:count]) + lot[count:]
                 for hypothesis, said in zip(lot, say(_transforms(lot)), strict=True):

@@ -21,7 +21,7 @@ from geomoe3d.clouds.prepare import (
     check_cloud,
     scale_mismatch,
 )
-from geomoe3d.config import RegistrationConfig, build_config
+from geomoe3d.config import RegistrationConfig, build_config, expert_in_force
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, check_rows
 from geomoe3d.decision.answer import failed_result
 from geomoe3d.decision.causes import differing_units
@@ -130,6 +130,7 @@ class Registrar:
         """
         return CorrespondenceRegistrar.of(self.pipeline).weigh(correspondences, voxel_size).weights
 
+    @expert_in_force
     def explain(
         self,
         source: Any,

@@ -3,9 +3,9 @@
     python scripts/measure_house.py [--constants]
 
 A constant is a number, or a tuple, list, set or mapping of numbers, that is given a name at the level of a
-module; ``config.py`` files, which hold the configuration, are left out. A circle is a set of files each of
-which imports, directly or through others, all of the others; imports inside functions count, those for type
-checkers alone do not.
+module; ``config.py`` files and the package ``config``, which hold the configuration, are left out. A circle is a
+set of files each of which imports, directly or through others, all of the others; imports inside functions count,
+those for type checkers alone do not.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main(most: int, list_constants: bool) -> None:
     found = [
         f"{path.relative_to(PACKAGE)}:{line} {name}"
         for path, tree in trees.items()
-        if path.name != "config.py"
+        if path.name != "config.py" and path.parent.name != "config"
         for name, line in constants(tree)
     ]
     click.echo(f"\n{len(found):7,}  numeric constants of modules outside the configuration")

@@ -249,7 +249,7 @@ def test_commented_yaml_reads_back_whatever_the_values(tmp_path):
 
 
 def test_commented_yaml_names_every_key_with_its_choices_and_limits():
-    text = commented_yaml(RegistrationConfig())
+    text = commented_yaml(RegistrationConfig(), expert=True)
     assert yaml.safe_load(text) == RegistrationConfig().model_dump(mode="json")
     assert re.search(r"one of auto, origin, guess, centroid\n  viewpoint: auto\n", text)
     assert re.search(r"# .*above 0\nvoxel_size: null\n", text)

@@ -10,7 +10,6 @@ import torch
 from corner_scenes import AT_ZERO, VOXEL, scene
 from judged_motions import network, turned
 
-from geomoe3d import correspondence_registration
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import EstimatorConfig, RegistrationConfig, build_config
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, likeliest_rows
@@ -53,9 +52,15 @@ class Weighed:
         return [opinion.verdict for opinion in found if opinion is not None]
 
 
-def weigh(given: Correspondences, estimator: EstimatorConfig | None = None) -> Weighed:
+def weigh(
+    given: Correspondences, estimator: EstimatorConfig | None = None, convinced: float = 3.0
+) -> Weighed:
     """What bare correspondences come to with an untrained network."""
-    config = RegistrationConfig(estimator=estimator or EstimatorConfig(), scoring={"scorers": ["surfaces"]})
+    config = RegistrationConfig(
+        estimator=estimator or EstimatorConfig(),
+        scoring={"scorers": ["surfaces"]},
+        expert={"correspondences": {"convinced": convinced}},
+    )
     pipeline = Pipeline(config)
     pipeline.scorers["network"] = Given(MotionJudge(FoldedGeoMoE.of(network())))
     threshold = config.estimator.inlier_threshold * VOXEL
@@ -146,11 +151,8 @@ def test_more_rows_than_are_scored_are_all_weighed_wherever_they_stand() -> None
 
 
 @pytest.mark.parametrize(("convinced", "looked_at"), [(-100.0, 2), (100.0, 6)])
-def test_a_network_stops_where_it_has_seen_enough(
-    convinced: float, looked_at: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(correspondence_registration, "CONVINCED", convinced)
-    found = weigh(Correspondences(scene(3)[0], viewpoints=AT_ZERO))
+def test_a_network_stops_where_it_has_seen_enough(convinced: float, looked_at: int) -> None:
+    found = weigh(Correspondences(scene(3)[0], viewpoints=AT_ZERO), convinced=convinced)
     assert len(found.verdicts) == looked_at < len(found.hypotheses)
     assert found.verdicts == sorted(found.verdicts, reverse=True)
 
@@ -161,14 +163,13 @@ def test_a_network_stops_where_it_has_seen_enough(
 def test_what_the_network_looks_at_is_drawn_closer(
     convinced: float, num_aligned: int, moved: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(correspondence_registration, "CONVINCED", convinced)
     monkeypatch.setattr("geomoe3d.estimators.keypoint_alignment._KEPT_AGREEMENT", 0.0)  # wrong ones slide
     # The same proposals whether or not they are drawn closer.
     monkeypatch.setattr(ConsensusEstimator, "with_less_effort", lambda self: self)
     rows, _ = scene(3, share=0.1)
 
     def found(count: int, given: Correspondences) -> list[Hypothesis]:
-        return weigh(given, EstimatorConfig(num_aligned=count)).hypotheses
+        return weigh(given, EstimatorConfig(num_aligned=count), convinced).hypotheses
 
     def motions(hypotheses: list[Hypothesis]) -> set[bytes]:
         return {h.T_target_source.tobytes() for h in hypotheses}

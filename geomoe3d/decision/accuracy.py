@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.decision.shared_surface import (
     Contact,
     SharedSurface,
@@ -21,13 +22,6 @@ from geomoe3d.decision.shared_surface import (
 from geomoe3d.geometry.se3 import cross_matrix, residuals, transform_points
 from geomoe3d.result import Accuracy
 from geomoe3d.types import Correspondences, FloatArray, PreparedCloud
-
-_LEAST_ROWS = 60
-# One residual as one observation of [rotation, translation], where the surfaces are much bent; and what a bend moves.
-# Generated rooms whose fragments are bent as those of depth cameras are, and rigid pairs of the sample room.
-_PER_RESIDUAL = np.array([0.36] * 3 + [0.84] * 3)
-_PER_DISTORTION = np.array([1.1] * 3 + [1.2] * 3) / np.sqrt(3)
-_SMALL_STRAIN = 0.006
 
 
 def measure_accuracy(
@@ -46,10 +40,10 @@ def measure_accuracy(
         threshold: of an inlier, cloud units.
 
     Returns:
-        None where fewer than 60 points lie on each other and face alike.
+        None where too few points lie on each other and face alike.
     """
     contact = SharedSurface(source, target).contact(T_target_source, threshold)
-    if len(contact.gaps) < _LEAST_ROWS:
+    if len(contact.gaps) < expert().accuracy.least_points:
         return None
     distances = np.abs(contact.gaps)
     agreeing = residuals(T_target_source, matched.source, matched.target)
@@ -77,13 +71,16 @@ def measure_accuracy(
 
 def _covariance(contact: Contact, center: FloatArray, voxel_size: float) -> tuple[float, FloatArray]:
     """Root mean square radius of what is shared, and the covariance (6, 6) of [rotation x radius, translation]."""
+    known = expert().accuracy
+    per_residual = np.repeat([known.residual_turn, known.residual_shift], 3)
+    per_bend = np.repeat([known.bend_turn, known.bend_shift], 3) / np.sqrt(3)
     offsets = contact.points - center
     radius = max(float(np.sqrt(np.mean(np.sum(offsets**2, axis=1)))), 1e-9 * voxel_size)
     X, normals, gaps = offsets / radius, contact.normals, contact.gaps
     weights = robust_weights(gaps, voxel_size)
     _, inverse, variance = solved(np.hstack([np.cross(X, normals), normals]), gaps, weights)
     strain = distortion_of(X, normals, gaps, weights, radius)
-    bent = (strain / (strain + _SMALL_STRAIN)) ** 2
+    bent = (strain / (strain + known.small_strain)) ** 2
     of_one = variance * float(weights.sum()) * inverse
-    common = bent**2 * of_one * np.outer(_PER_RESIDUAL, _PER_RESIDUAL)
-    return radius, common + np.diag((_PER_DISTORTION * strain * radius) ** 2)
+    common = bent**2 * of_one * np.outer(per_residual, per_residual)
+    return radius, common + np.diag((per_bend * strain * radius) ** 2)

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.confidence import Information, Judgement
 from geomoe3d.decision.scale import Scale
 from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames, transform_points
@@ -18,7 +18,6 @@ from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
 from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-_BELIEVED, _WRONG_SCALE_CONFIDENCE = 0.3, 0.5
 _DECIDING_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "open3d", "small_gicp", "trimesh", "torch")
 
 
@@ -79,7 +78,7 @@ class Decision:
         sentence calls the second cloud the source.
         """
         was = self.judgement
-        if scale is None or not scale.differs or was.confidence < _BELIEVED:
+        if scale is None or not scale.differs or was.confidence < expert().causes.least_believed:
             return replace(self, scale=scale)
         said = (scale.exchanged() if exchanged else scale).sentence()
         return replace(self, scale=scale).doubted(said)
@@ -88,7 +87,7 @@ class Decision:
         """The same decision, never ok, for a reason that is said first."""
         was = self.judgement
         status: Status = "low_confidence" if was.status == "ok" else was.status
-        confidence = min(was.confidence, _WRONG_SCALE_CONFIDENCE)
+        confidence = min(was.confidence, expert().causes.most_doubted)
         return replace(self, judgement=Judgement(status, (reason, *was.reasons), confidence))
 
     def residuals(self, matched: Correspondences) -> FloatArray:

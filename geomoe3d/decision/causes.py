@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from geomoe3d.clouds.prepare import robust_extent
+from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.scale import likely_unit_ratio, seeming_units
 from geomoe3d.decision.similarity import mirrored_cloud, scaled_cloud
@@ -12,9 +13,6 @@ from geomoe3d.errors import EmptyCloudError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import PointCloud
-
-_SURE = 0.99
-_CLEARLY_BETTER = 3.0  # times the score
 
 Register = Callable[[PointCloud, PointCloud], RegistrationResult]
 """Registers two clouds at the scale that they have."""
@@ -53,12 +51,12 @@ def mirrored_axes(
     Nothing is registered where the answer is quite sure.
     """
     judgement = decision.judgement
-    if judgement.status == "ok" and judgement.confidence > _SURE:
+    if judgement.status == "ok" and judgement.confidence > expert().causes.sure:
         return None
     clock("mirrored")
     found = register(mirrored_cloud(clouds[0]), clouds[1])
     score = 0.0 if decision.answer is None else decision.answer.score
-    if not found.ok or found.evidence["score"] < _CLEARLY_BETTER * score:
+    if not found.ok or found.evidence["score"] < expert().causes.mirrored_lead * score:
         return None
     return (
         f"mirrored: with x of '{clouds[0].name}' the other way round the clouds fit (confidence "

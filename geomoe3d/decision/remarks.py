@@ -10,15 +10,11 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.prepare import choose_voxel_size
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.types import PointCloud, PreparedCloud
 
-_FLAT = 1e-6  # thickness over extent of what has no surface in space
 _NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 99999.0)  # what programs write for no measurement
-_LEAST_NO_DATA = 3
-_UNUSUAL = 3.0  # times the voxel size that would be chosen
-_FEW_VOXELS = 100  # far below what the chosen grid aims at
 
 
 def remarks(
@@ -51,13 +47,13 @@ def remarks(
         return
     for cloud in described:
         spread = np.linalg.svd(cloud.points - cloud.points.mean(0), compute_uv=False)
-        if spread[2] < _FLAT * spread[0]:
+        if spread[2] < expert().remarks.flat * spread[0]:
             yield (
                 f"'{cloud.name}' is flat: all its points lie in one plane, as those of a 2-D scanner do; this method "
                 "compares surfaces in space, so give scans with height"
             )
     fewest = min(described, key=len)
-    if len(fewest) < _FEW_VOXELS:
+    if len(fewest) < expert().remarks.few_voxels:
         yield (
             f"'{fewest.name}' fills only {len(fewest)} voxels of edge {voxel_size:.4g}; a smaller voxel size "
             "leaves more to go by"
@@ -79,7 +75,8 @@ def data_remarks(
     for loaded in clouds:
         yield from _no_data(loaded)
     usual = choose_voxel_size(*clouds, config.voxel_points)
-    if not 1 / _UNUSUAL < wanted / usual < _UNUSUAL:
+    most = expert().remarks.unusual_size
+    if not 1 / most < wanted / usual < most:
         size = "large" if wanted > usual else "small"
         yield (
             f"the voxel size {wanted:.4g} is {size} for these clouds: without one given {usual:.4g} would be taken"
@@ -92,7 +89,7 @@ def _no_data(cloud: PointCloud) -> Iterator[str]:
         values = cloud.points[:, axis] + cloud.origin[axis]
         for number in _NO_DATA:
             count = int(np.count_nonzero(values == number))
-            if _LEAST_NO_DATA <= count < len(values):
+            if expert().remarks.least_no_data <= count < len(values):
                 yield (
                     f"'{cloud.name}': {count:,} points have the {name} {number:.0f}, which stands for no measurement "
                     "in many programs; remove them"

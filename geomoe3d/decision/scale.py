@@ -12,25 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.decision.shared_surface import SharedSurface, distortion_of, robust_weights, solved
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray, PreparedCloud
 
-# In voxels: reach of the nearest neighbours from round to round, wide enough at first for a scale of 0.8.
-_REACHES = (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5)
-_LEAST_MATCHED = 60  # of twelve unknowns
-_RANGE = (0.3, 3.0)
-# The error of the scale over the distortion, and of the fit over what independent points would leave: from
-# generated rooms; docs/measurements.md holds what came of it on real fragments.
-_PER_DISTORTION, _PER_FORMAL = 0.8, 4.5
-# Firmly measured, right answers on real fragments are hardly off by more than 5 per cent: beyond 6 per cent half
-# as many deviations do.
-_SIGNIFICANT, _TOLERATED, _UNHEARD_OF, _FIRM = 2.6, 0.01, 0.06, 0.05
-
 DIFFERS = "the scale differs"
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "metres": 1.0}
-_UNIT_TOLERANCE = 0.02
-_EXTENT_TOLERANCE = 1.5  # twice applied, it never leads from one unit to the next
 
 
 @dataclass(frozen=True)
@@ -49,9 +37,10 @@ class Scale:
     def differs(self) -> bool:
         """Whether the ratio is off 1 by more than one per cent and more than 2.6 deviations, or, beyond six per cent
         and where the deviation is under five, more than 1.3."""
-        off = abs(float(np.log(self.ratio)))
-        enough = _SIGNIFICANT / 2 if off > _UNHEARD_OF and self.sigma < _FIRM else _SIGNIFICANT
-        return off > max(enough * self.sigma, _TOLERATED)
+        off, known = abs(float(np.log(self.ratio))), expert().scale
+        unheard_of = off > known.unheard_of and self.sigma < known.firm
+        enough = known.significant / 2 if unheard_of else known.significant
+        return off > max(enough * self.sigma, known.tolerated)
 
     def exchanged(self) -> Scale:
         """The same of the target beside the source."""
@@ -77,10 +66,10 @@ def measure_scale(T_target_source: FloatArray, source: PreparedCloud, target: Pr
         source, target: on one grid.
 
     Returns:
-        None where fewer than 60 points lie on each other, or the fit runs away.
+        None where too few points lie on each other, or the fit runs away.
     """
     fit = _Fit(T_target_source, source, target)
-    for reach in _REACHES:
+    for reach in expert().scale.reaches:
         if not fit.step(reach * source.voxel_size):
             return None
     return Scale(float(1 / fit.scale), fit.deviation())
@@ -99,7 +88,7 @@ class _Fit:
 
         contact = self._shared.contact(make_transform(self._R, self._t), reach, self.scale)
         points, normals, gaps = contact.points, contact.normals, contact.gaps
-        if len(points) < 2 * _LEAST_MATCHED:
+        if len(points) < 2 * expert().scale.least_points:
             return False
         weights = robust_weights(gaps, self._voxel)
         center = points.mean(0)
@@ -111,20 +100,21 @@ class _Fit:
         growth, turn = 1 + x[6] / self._radius, Rotation.from_rotvec(x[:3] / self._radius).as_matrix()
         self._t = center + growth * turn @ (self._t - center) + x[3:6]
         self._R, self.scale = turn @ self._R, self.scale * growth
-        return _RANGE[0] < self.scale < _RANGE[1]
+        return expert().scale.smallest < self.scale < expert().scale.largest
 
     def deviation(self) -> float:
         """One standard deviation of ln(scale), from the distortion that is left and from the fit."""
         distortion = distortion_of(*self._rows, self._radius)
         formal = float(np.sqrt(self._variance * self._inverse[6, 6])) / self._radius
-        return float(np.hypot(_PER_DISTORTION * distortion, _PER_FORMAL * formal))
+        known = expert().scale
+        return float(np.hypot(known.per_distortion * distortion, known.per_formal * formal))
 
 
 def seeming_units(ratio: float, names: tuple[str, str] = ("the source", "the target")) -> str:
     """An end of a sentence that names the two units in which one body gives this ratio of lengths, to 2 %; else
     empty. Feet are international or US survey ones, which differ by two millionths."""
     for (source, target), expected in _unit_ratios().items():
-        if abs(np.log(ratio / expected)) < _UNIT_TOLERANCE:
+        if abs(np.log(ratio / expected)) < expert().scale.unit_tolerance:
             return f"; {names[0]} seems to be in {source}, {names[1]} in {target}"
     return ""
 
@@ -135,7 +125,7 @@ def likely_unit_ratio(extents: tuple[float, float]) -> float | None:
         return None
     found = np.log(extents[0] / extents[1])
     nearest = min(_unit_ratios().values(), key=lambda ratio: abs(np.log(ratio) - found))
-    return nearest if abs(np.log(nearest) - found) < np.log(_EXTENT_TOLERANCE) else None
+    return nearest if abs(np.log(nearest) - found) < np.log(expert().scale.extent_tolerance) else None
 
 
 def _unit_ratios() -> dict[tuple[str, str], float]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import MOST_LEAD, Judgement, judge, lead_over, measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
@@ -24,12 +24,6 @@ from geomoe3d.scoring.base import PairScorer, Scorer
 from geomoe3d.scoring.surfaces import SURFACES, SurfaceScorer, evidence_of
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
-_MOST_RIVALS = 3  # refined where they come close, before the best is taken for the rival
-_KEPT_EVIDENCE = 0.8  # a refinement that loses more of the evidence than this is thrown away
-_MOST_ROUNDS = 6  # further hypotheses shown one by one, where a scorer rejects those that the clouds like
-_DISTINCT_THRESHOLDS = 3.0  # shift at the centroid from which two transforms are different
-_MOST_TURN_DEG = 15.0
-_MOST_UNREFINED = 0.5
 _UNREFINED = (
     "the answer could not be refined without fitting less well, and where the sensors stood is not known; right "
     "answers can be"
@@ -111,9 +105,9 @@ class Selection:
         support, count = self._support(answer), len(self._pair.matched)
         judgement = judge(answer, rival, lead, support, information, self._config.decision, count)
         if judgement.status == "ok" and answer.note is not None and self._pair.matched.viewpoints is None:
-            # Of 139 answers that were ok on real scans, one had not been refined, and its sensors were known. Scans of
-            # two places that were ok had not been either.
-            judgement = Judgement("low_confidence", (_UNREFINED, *judgement.reasons), _MOST_UNREFINED)
+            # Scans of two places that were ok had not been refined either.
+            most = expert().selection.most_unrefined
+            judgement = Judgement("low_confidence", (_UNREFINED, *judgement.reasons), most)
         decision = Decision(answer, rival, lead, information, judgement, tuple(self.hypotheses))
         for note in (answer.note, self._overruled(answer)):
             decision = decision if note is None else decision.with_note(note)
@@ -140,7 +134,7 @@ class Selection:
             return
         by_clouds = sorted(self.hypotheses, key=lambda h: -evidence_of(h).surface_score)
         shown = distinct(by_clouds, self._source, self._shift, count)
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(expert().selection.most_rounds):
             if not self._ask(name, [h for h in shown if name not in h.asked]):
                 return
             known = [h.scores[name] for h in self.hypotheses if name in h.asked]
@@ -192,7 +186,8 @@ class Selection:
         refined = start if T is None else replace(start, T_target_source=T, scores={}, asked=set())
         self._ask(SURFACES, [start])
         self._ask(SURFACES, [refined])
-        if evidence_of(refined).surface_score < _KEPT_EVIDENCE * evidence_of(start).surface_score:
+        least = expert().selection.kept_evidence * evidence_of(start).surface_score
+        if evidence_of(refined).surface_score < least:
             return replace(
                 start, note="refinement made the clouds fit less well; the unrefined transform is given"
             )
@@ -202,7 +197,7 @@ class Selection:
         """The best clearly different hypothesis, and the answer's lead over it."""
         best: Hypothesis | None = None
         different = (h for h in self.hypotheses if self._differ(answer, h))
-        for other in distinct(different, self._source, self._shift, _MOST_RIVALS):
+        for other in distinct(different, self._source, self._shift, expert().selection.most_rivals):
             # A fair race: a rival that could matter is refined too. One that refines to the answer itself was only
             # proposed less well, and is none: how far off it was proposed is an accident.
             close = lead_over(answer.score, other.score) < MOST_LEAD
@@ -237,7 +232,7 @@ class Selection:
 
     @property
     def _shift(self) -> float:
-        return _DISTINCT_THRESHOLDS * self._pair.inlier_threshold
+        return expert().selection.different_shift * self._pair.inlier_threshold
 
 
 def distinct(
@@ -263,4 +258,4 @@ def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_s
         max_shift: transforms closer than this, cloud units, and closer than 15 degrees are the same.
     """
     shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
-    return shift > max_shift or turn > _MOST_TURN_DEG
+    return shift > max_shift or turn > expert().selection.different_turn_deg

@@ -10,13 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
-
-_LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
-_MOST_ASKED = 4000  # points of each cloud
-_CUT = 4.0  # gaps beyond so many robust deviations count for nothing
-_LEAST_DEVIATION = 0.05  # in voxels: means of a grid are no better
 
 
 @dataclass(frozen=True)
@@ -45,7 +41,8 @@ class SharedSurface:
 
         self._clouds = source, target
         self._trees = tuple(cKDTree(cloud.points) for cloud in self._clouds)
-        self._asked = tuple(drawn_rows(c.points, c.voxel_size, _MOST_ASKED) for c in self._clouds)
+        most = expert().shared_surface.most_asked
+        self._asked = tuple(drawn_rows(c.points, c.voxel_size, most) for c in self._clouds)
 
     def contact(self, T_target_source: FloatArray, reach: float, scale: float = 1.0) -> Contact:
         """Points within ``reach``, cloud units, whose normals agree up to sign, under a similarity.
@@ -63,7 +60,8 @@ class SharedSurface:
         first = np.concatenate([rows[ours], found])
         second = np.concatenate([theirs, back_rows[backwards]])
         normals = np.vstack([target.normals[theirs], turned[found]])
-        agree = np.abs(np.einsum("ij,ij->i", turned[first], target.normals[second])) > _LEAST_COSINE
+        cosines = np.abs(np.einsum("ij,ij->i", turned[first], target.normals[second]))
+        agree = cosines > expert().shared_surface.least_cosine
         points, normals = moved[first][agree], normals[agree]
         gaps = np.einsum("ij,ij->i", target.points[second][agree] - points, normals)
         return Contact(points, normals, gaps, (len(ours) / len(rows), len(found) / len(back_rows)))
@@ -76,9 +74,10 @@ class SharedSurface:
 
 
 def robust_weights(gaps: FloatArray, voxel_size: float) -> FloatArray:
-    """(n,) in [0, 1], Tukey's: gaps beyond four robust deviations count for nothing."""
-    spread = max(1.4826 * float(np.median(np.abs(gaps))), _LEAST_DEVIATION * voxel_size)
-    weights: FloatArray = np.maximum(1 - (gaps / (_CUT * spread)) ** 2, 0.0) ** 2
+    """(n,) in [0, 1], Tukey's: gaps beyond some robust deviations, ``cut``, count for nothing."""
+    known = expert().shared_surface
+    spread = max(1.4826 * float(np.median(np.abs(gaps))), known.least_deviation * voxel_size)
+    weights: FloatArray = np.maximum(1 - (gaps / (known.cut * spread)) ** 2, 0.0) ** 2
     return weights
 
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from geomoe3d.clouds.prepare import robust_extent
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.config import DecisionConfig, RegistrationConfig, expert
 from geomoe3d.decision.answer import failed_result
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.scale import DIFFERS, seeming_units
@@ -31,14 +31,6 @@ Attempt = Callable[[float, bool], Explanation]
 
 Explain = Callable[..., Explanation]
 """`Registrar.explain`."""
-
-_STEP, _RUNGS = 1.2, 7  # from the ratio of extents up to 3.6 times more and less
-_LARGEST = 1100.0  # that of two extents is no more than about right
-_PROMISING = 0.3  # confidence from which surfaces are believed to say the ratio
-_MOST_SETTLING, _SETTLED = 4, 0.002
-_MOST_THOROUGH = 2
-_LEAST_CONFIDENCE = 0.95
-_SAME = 0.02  # closer logarithms of ratios are those of one place
 
 
 def explain_similarity(
@@ -102,14 +94,14 @@ def find_similarity(
     for ratio in ratios:
         found = attempt(ratio, False)
         tried.append((found, ratio))
-        if found.result.confidence >= _PROMISING:
+        if found.result.confidence >= expert().similarity.promising:
             settled.append(_settle(found, ratio, attempt))
             if _one_of_many(settled[-1][0], len(tried)).result.ok:
                 best, at = _climb(*settled[-1], attempt)
                 return _one_of_many(best, len(tried)), at
     settled += tried
     settled.sort(key=_surest)
-    for _, ratio in _distinct(settled)[:_MOST_THOROUGH]:
+    for _, ratio in _distinct(settled)[: expert().similarity.most_thorough]:
         settled.append(_settle(attempt(ratio, True), ratio, attempt, thorough=True))
     best, at = min(settled, key=_surest)
     return _one_of_many(best, len(tried)), at
@@ -124,7 +116,7 @@ def _distinct(ranked: list[tuple[Explanation, float]]) -> list[tuple[Explanation
     """Those whose ratio is not about that of one before."""
     kept: list[tuple[Explanation, float]] = []
     for one in ranked:
-        if all(abs(np.log(one[1] / other[1])) > _SAME for other in kept):
+        if all(abs(np.log(one[1] / other[1])) > expert().similarity.same for other in kept):
             kept.append(one)
     return kept
 
@@ -137,7 +129,7 @@ def _one_of_many(found: Explanation, num_tried: int) -> Explanation:
     result = found.result
     odds = result.confidence / max(1 - result.confidence, 1e-12) / (1 + num_tried)
     confidence = odds / (1 + odds)
-    least = result.config.get("decision", {}).get("min_confidence", _LEAST_CONFIDENCE)
+    least = result.config.get("decision", {}).get("min_confidence", DecisionConfig().min_confidence)
     if not result.ok or confidence >= least:
         return replace(found, result=replace(result, confidence=confidence))
     reason = (
@@ -153,8 +145,9 @@ def _one_of_many(found: Explanation, num_tried: int) -> Explanation:
 def likely_ratios(source: PointCloud, target: PointCloud) -> list[float]:
     """Ratios of lengths, source over target, the nearest to that of the extents first; from 1/1000 to 1000."""
     middle = robust_extent(source.points) / robust_extent(target.points)
-    ratios = [middle * _STEP**rung for rung in sorted(range(-_RUNGS, _RUNGS + 1), key=abs)]
-    return [ratio for ratio in ratios if 1 / _LARGEST <= ratio <= _LARGEST]
+    known = expert().similarity
+    ratios = [middle * known.step**rung for rung in sorted(range(-known.rungs, known.rungs + 1), key=abs)]
+    return [ratio for ratio in ratios if 1 / known.largest <= ratio <= known.largest]
 
 
 def _settle(
@@ -164,10 +157,10 @@ def _settle(
 
     ``thorough``: at most once, with all looks.
     """
-    best, at = found, ratio
-    for _ in range(1 if thorough else _MOST_SETTLING):
+    best, at, known = found, ratio, expert().similarity
+    for _ in range(1 if thorough else known.most_settling):
         off = found.result.evidence.get("scale_ratio")
-        if off is None or abs(np.log(off)) < _SETTLED:
+        if off is None or abs(np.log(off)) < known.settled:
             break
         ratio *= off
         found = attempt(ratio, thorough)
@@ -178,13 +171,14 @@ def _settle(
 
 def _climb(best: Explanation, ratio: float, attempt: Attempt) -> tuple[Explanation, float]:
     """What scores higher than an answer at the neighbouring ratios, settled, and so on."""
-    for _ in range(_RUNGS):
-        for side in (_STEP, 1 / _STEP):
+    known = expert().similarity
+    for _ in range(known.rungs):
+        for side in (known.step, 1 / known.step):
             near = attempt(ratio * side, False)
             if _score(near) <= _score(best):
                 continue
             other, at = _settle(near, ratio * side, attempt)
-            if _score(other) > _score(best) and abs(np.log(at / ratio)) > _SAME:
+            if _score(other) > _score(best) and abs(np.log(at / ratio)) > expert().similarity.same:
                 best, ratio = other, at
                 break
         else:

@@ -24,7 +24,7 @@ from geomoe3d.clouds.prepare import (
 )
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.clouds.viewpoint import find_viewpoints
-from geomoe3d.config import RegistrationConfig, build_config
+from geomoe3d.config import RegistrationConfig, build_config, expert_in_force
 from geomoe3d.decision.answer import failed_result, finished_result
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError, InputError
@@ -187,6 +187,7 @@ class Map:
         """
         save(path, self.sources, self._voxels, self._levels, force=force)
 
+    @expert_in_force
     def with_cloud(
         self,
         cloud: Any,
@@ -227,6 +228,7 @@ class Map:
         sources = (*self.sources, Source(read.name, read.sha256, count))
         return Map(voxels, (), sources, config=self.config, name=name, line=self._line)
 
+    @expert_in_force
     def describe(self, voxel_size: float | None = None, *, progress: Progress | None = None) -> None:
         """Describe the map on a grid now, so that the first scan need not wait for it.
 
@@ -256,6 +258,7 @@ class Map:
         """Grids on which the map is described, cloud units; scans that want another one get it once."""
         return tuple(level.voxel_size for level in self._levels)
 
+    @expert_in_force
     def locate(
         self,
         scan: Any,

@@ -10,26 +10,34 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 import yaml
 
-from geomoe3d.config import Section
+from geomoe3d.config import ExpertConfig, Section
 
 _LIMITS = (("ge", "at least {}"), ("gt", "above {}"), ("le", "at most {}"), ("lt", "below {}"))
 
 
-def commented_yaml(config: Section) -> str:
-    """The whole tree, a comment of meaning, choices and limits above each value."""
-    return "\n".join([*_comment(type(config).__doc__ or "", ""), "", *_section(config, "")]) + "\n"
+def commented_yaml(config: Section, *, expert: bool = False) -> str:
+    """The whole tree, a comment of meaning, choices and limits above each value.
+
+    ``expert``: with all constants for experts; else with those that are not at their defaults.
+    """
+    return "\n".join([*_comment(type(config).__doc__ or "", ""), "", *_section(config, "", expert)]) + "\n"
 
 
-def _section(section: Section, indent: str) -> list[str]:
+def _section(section: Section, indent: str, expert: bool, among_constants: bool = False) -> list[str]:
     lines: list[str] = []
     for name, info in type(section).model_fields.items():
         value = getattr(section, name)
+        constants = among_constants or isinstance(value, ExpertConfig)
+        if constants and not expert and value == getattr(type(section)(), name):
+            continue
         if isinstance(value, Section):
             lines += ["", *_comment(type(value).__doc__ or "", indent), f"{indent}{name}:"]
-            lines += _section(value, indent + "  ")
+            lines += _section(value, indent + "  ", expert, constants)
             continue
         limits = _limits(info.metadata) + _limits_inside(info.annotation)
-        parts = [info.description or "", _choices(info.annotation), ", ".join(limits)]
+        about = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}
+        unit, source = (f"{about[key]}" if about.get(key, "-") != "-" else "" for key in ("unit", "source"))
+        parts = [unit, info.description or "", _choices(info.annotation), ", ".join(limits), source]
         lines += _comment("; ".join(part for part in parts if part), indent)
         lines.append(f"{indent}{name}: {_scalar(value)}")
     return lines

@@ -1,31 +1,17 @@
-"""Typed, frozen configuration; an unknown key is an error that names the nearest known one.
+"""The configuration of a registration: one section for each part of the line, and one for experts.
 
 Lengths are given in multiples of the voxel size, so that one configuration serves 5 cm rooms and 30 cm
-lidar; only ``voxel_size`` itself and ``viewpoint`` are in cloud units. YAML files hold the same tree
-(see configs/).
+lidar; only ``voxel_size`` itself is in cloud units.
 """
 
 from __future__ import annotations
 
-import difflib
-from pathlib import Path
-from typing import Any, Literal, TypeVar, get_origin
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
-from geomoe3d.errors import ConfigError, MissingConfigError
-
-S = TypeVar("S", bound="Section")
-
-
-class Section(BaseModel):
-    """A node of the configuration tree: frozen, strict about keys, lenient about 1 against 1.0."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
-
-    def __hash__(self) -> int:
-        """Of the values; options of parts are mappings, which have no hash of their own."""
-        return hash(self.model_dump_json())
+from geomoe3d.config.expert import ExpertConfig
+from geomoe3d.config.section import Section
 
 
 class PartConfig(Section):
@@ -230,9 +216,10 @@ class RegistrationConfig(Section):
     refinement: RefinementConfig = RefinementConfig()
     second_look: SecondLookConfig = SecondLookConfig()
     decision: DecisionConfig = DecisionConfig()
+    expert: ExpertConfig = ExpertConfig()
 
 
-_MOVED = {
+MOVED = {
     "judgement": "decision",
     "verification": "scoring",
     "verification.enabled": "scoring.scorers ([] for false)",
@@ -242,127 +229,3 @@ _MOVED = {
     "refinement.method": "refinement.name",
 }
 """Keys of version 0.1.0 and where they stand now."""
-
-
-_INSTALLED = Path(__file__).with_name("configs")  # in a checkout they stand beside the package
-_CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "configs"
-
-
-def known_keys(section: type[Section], prefix: str = "") -> list[str]:
-    """Dotted names of every leaf of a configuration tree, in declaration order."""
-    keys: list[str] = []
-    for name, info in section.model_fields.items():
-        kind = info.annotation
-        generic = get_origin(kind) is not None  # Python 3.10 takes list[int] for a type
-        if not generic and isinstance(kind, type) and issubclass(kind, Section):
-            keys += known_keys(kind, f"{prefix}{name}.")
-        else:
-            keys.append(prefix + name)
-    return keys
-
-
-def build_config(section: type[S], tree: dict[str, Any] | None, where: str = "configuration") -> S:
-    """Validate a nested mapping into a configuration.
-
-    Args:
-        section: the class of the root.
-        tree: nested mapping as YAML gives it; None or empty means all defaults.
-        where: what to call the source in messages.
-
-    Raises:
-        ConfigError: an unknown key (names the nearest known one) or a value out of its range.
-    """
-    if tree is not None and not isinstance(tree, dict):
-        raise ConfigError(f"{where}: expected a mapping of keys to values, found {type(tree).__name__}")
-    try:
-        return section.model_validate(tree or {})
-    except ValidationError as error:
-        raise ConfigError(f"{where}: {_explain(error, section)}") from None
-
-
-def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
-    """Apply ``a.b=value`` strings (value parsed as YAML) to a copy of a nested mapping.
-
-    Raises:
-        ConfigError: an assignment without ``=`` or through a key that is no section.
-    """
-    import copy
-
-    import yaml
-
-    result = copy.deepcopy(tree)
-    for assignment in assignments:
-        key, equals, text = assignment.partition("=")
-        if not equals or not key.strip():
-            raise ConfigError(f"'{assignment}' is no assignment; write key=value, e.g. estimator.name=ransac")
-        node = result
-        *parents, leaf = key.strip().split(".")
-        for parent in parents:
-            child = node.setdefault(parent, {})
-            if not isinstance(child, dict):
-                raise ConfigError(f"'{assignment}': '{parent}' holds a value, not a section")
-            node = child
-        try:
-            node[leaf] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"'{assignment}': the value is not valid YAML ({error})") from None
-    return result
-
-
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read one YAML mapping; ``configs/...`` are those that come with the package, wherever it is called.
-
-    Raises:
-        ConfigError: the file is missing, unreadable, no YAML, or holds no mapping.
-    """
-    import yaml
-
-    try:
-        tree = yaml.safe_load(_shipped(Path(path)).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        names = [str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml"))]
-        close = difflib.get_close_matches(str(path), names, n=1, cutoff=0.75)
-        hint = f"; did you mean {close[0]}, which comes with geomoe3d?" if close else ""
-        raise MissingConfigError(f"cannot read configuration '{path}': {error.strerror}{hint}") from None
-    except OSError as error:
-        raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"'{path}' is not valid YAML: {error}") from None
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"'{path}' holds a {type(tree).__name__}, expected a mapping of keys to values")
-    return tree
-
-
-def _shipped(path: Path) -> Path:
-    """The file itself; where there is none, the one of that name among those that come with the package."""
-    return path if path.exists() or path.is_absolute() else _CONFIGS.parent / path
-
-
-def load_config(path: str | Path | None = None, assignments: list[str] | None = None) -> RegistrationConfig:
-    """The registration configuration of a YAML file (None: defaults) with ``key=value`` overrides."""
-    tree = read_yaml(path) if path is not None else {}
-    return build_config(RegistrationConfig, set_keys(tree, assignments or []), str(path or "configuration"))
-
-
-def _explain(error: ValidationError, section: type[Section]) -> str:
-    parts = []
-    for problem in error.errors():
-        key = ".".join(str(part) for part in problem["loc"])
-        if problem["type"] == "extra_forbidden":
-            hint = f"it is now {_MOVED[key]}" if key in _MOVED else _nearest(key, known_keys(section))
-            parts.append(f"unknown key '{key}'; {hint}")
-        elif problem["type"] in ("model_type", "model_attributes_type"):
-            parts.append(f"'{key}' is a section, found {problem['input']!r}; did you mean {key}.name?")
-        else:
-            parts.append(f"'{key}' = {problem['input']!r}: {problem['msg']}")
-    return "; ".join(parts)
-
-
-def _nearest(key: str, keys: list[str]) -> str:
-    close = difflib.get_close_matches(key, keys, n=1, cutoff=0.4)
-    if not close:  # the leaf alone often matches where the section was forgotten
-        leaves = {name.rsplit(".", 1)[-1]: name for name in keys}
-        close = [leaves[m] for m in difflib.get_close_matches(key.rsplit(".", 1)[-1], list(leaves), n=1)]
-    return f"did you mean '{close[0]}'?" if close else "known keys: " + ", ".join(keys)

@@ -1,0 +1,82 @@
+"""Every number that decides an answer and is nobody's setting: one section for each part, with unit, source and range.
+
+`geomoe3d config --all` prints them, ``--set expert.scale.tolerated=0.02`` changes one, and each result holds those
+that it was made with. Code that needs one asks `expert()`, which is the section of the configuration at work in this
+thread: the doors into the package (`Registrar`, `CorrespondenceRegistrar`, `Map`, ...) put theirs in force, and
+outside of these the defaults hold. So a fit of three lines need not be handed a configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
+
+from geomoe3d.config.expert_decision import (
+    AccuracyExpert,
+    CausesExpert,
+    RemarksExpert,
+    ScaleExpert,
+    SelectionExpert,
+    SharedSurfaceExpert,
+    SimilarityExpert,
+)
+from geomoe3d.config.expert_proposing import CorrespondencesExpert
+from geomoe3d.config.section import Section
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class ExpertConfig(Section):
+    """Constants of the method. The confidence was fitted with these values: change them to study the method."""
+
+    correspondences: CorrespondencesExpert = CorrespondencesExpert()
+    selection: SelectionExpert = SelectionExpert()
+    shared_surface: SharedSurfaceExpert = SharedSurfaceExpert()
+    accuracy: AccuracyExpert = AccuracyExpert()
+    scale: ScaleExpert = ScaleExpert()
+    similarity: SimilarityExpert = SimilarityExpert()
+    causes: CausesExpert = CausesExpert()
+    remarks: RemarksExpert = RemarksExpert()
+
+
+_IN_FORCE: ContextVar[ExpertConfig] = ContextVar("expert constants in force")
+_DEFAULTS = ExpertConfig()
+
+
+def expert() -> ExpertConfig:
+    """The constants in force in this thread."""
+    return _IN_FORCE.get(_DEFAULTS)
+
+
+@contextmanager
+def in_force(constants: ExpertConfig) -> Iterator[None]:
+    """Inside, `expert` gives these."""
+    token = _IN_FORCE.set(constants)
+    try:
+        yield
+    finally:
+        _IN_FORCE.reset(token)
+
+
+class _Configured(Protocol):
+    @property
+    def config(self) -> Any:
+        """A `RegistrationConfig`."""
+
+
+Owner = TypeVar("Owner", bound=_Configured)
+
+
+def expert_in_force(method: Callable[Concatenate[Owner, P], R]) -> Callable[Concatenate[Owner, P], R]:
+    """Decorator of a method: inside, the constants of its object's ``config`` are in force."""
+
+    @wraps(method)
+    def inside(self: Owner, *args: P.args, **kwargs: P.kwargs) -> R:
+        with in_force(self.config.expert):
+            return method(self, *args, **kwargs)
+
+    return cast(Callable[Concatenate[Owner, P], R], inside)

@@ -158,8 +158,8 @@ class DescriptorRun:
 
     def _update(self, batch: ContrastBatch) -> Tensor:
         """One step; loss and share found."""
-        done = self.step / self.config.steps
-        rate = min(1.0, (self.step + 1) / 100) * (0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * done)))
+        falling = 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * self._done()))
+        rate = min(1.0, (self.step + 1) / 100) * falling
         for group in self.optimizer.param_groups:
             group["lr"] = rate * self.config.learning_rate
         self.optimizer.zero_grad()
@@ -171,6 +171,10 @@ class DescriptorRun:
         torch._foreach_lerp_(list(self.averaged.parameters()), list(self.network.parameters()), 1 - keep)
         self.step += 1
         return torch.stack([loss.detach(), share])
+
+    def _done(self) -> float:
+        """Share of the schedule behind us."""
+        return self.step / self.config.steps
 
     def _loss(self, network: DescriptorNetwork, batch: ContrastBatch) -> tuple[Tensor, Tensor]:
         features = network(batch.view).view(len(batch.apart), -1, LEARNED)

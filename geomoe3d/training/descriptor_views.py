@@ -87,10 +87,11 @@ class Fragment:
             corner, turn: (3,) and (3, 3), how the coarser grids lie.
         """
         preparation, describe = PreparationConfig(), DescriptorConfig()
-        radius, count = preparation.normal_radius, preparation.normal_neighbors
-        normals = plane_normals(points, radius, count)
+        near = nearest_points(points, points, describe.neighbors)
+        few = near[0][:, : preparation.normal_neighbors], near[1][:, : preparation.normal_neighbors]
+        normals = plane_normals(points, preparation.normal_radius, few)
         normals = torch.where(((sensor - points) * normals).sum(1, keepdim=True) < 0, -normals, normals)
-        own = fpfh(points, normals, describe.radius, describe.neighbors)
+        own = fpfh(points, normals, describe.radius, near)
         grids = []
         for edge in FACTORS:
             rows = torch.arange(len(points), device=points.device)
@@ -101,7 +102,8 @@ class Fragment:
             some = points[rows], normals[rows]
             given = own[rows]
             if edge > 1:
-                wide = fpfh(*some, describe.radius * edge, describe.neighbors)
+                near = nearest_points(some[0], some[0], describe.neighbors)
+                wide = fpfh(*some, describe.radius * edge, near)
                 given = torch.cat([given, wide], 1)
             grids.append(Grid(*some, given.half(), edge))
         fine, middle, coarse = grids

@@ -30,9 +30,14 @@ def nearest_points(at: Tensor, of: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return torch.cat([f.values for f in found]), torch.cat([f.indices for f in found])
 
 
-def plane_normals(points: Tensor, radius: float, count: int) -> Tensor:
-    """Unit normals (n, 3) of the planes through each point's neighbours, its own place among them; sign arbitrary."""
-    distance, rows = nearest_points(points, points, count)
+def plane_normals(points: Tensor, radius: float, near: tuple[Tensor, Tensor]) -> Tensor:
+    """Unit normals (n, 3) of the planes through each point's neighbours, itself among them; sign arbitrary.
+
+    Args:
+        points: (n, 3) float32. radius: farther neighbours do not count.
+        near: distances and rows (n, k) of the nearest points, see `nearest_points`.
+    """
+    distance, rows = near
     weight = (distance <= radius).to(points.dtype)[..., None]
     total = weight.sum(1, keepdim=True)
     way = points[rows] - points[:, None]
@@ -67,17 +72,17 @@ def smallest_axes(matrices: Tensor) -> Tensor:
     return found.to(matrices.dtype)
 
 
-def fpfh(points: Tensor, normals: Tensor, radius: float, count: int) -> Tensor:
+def fpfh(points: Tensor, normals: Tensor, radius: float, near: tuple[Tensor, Tensor]) -> Tensor:
     """FPFH (n, 33) of length 1; zero where a point has no neighbour.
 
     Args:
         points: (n, 3) float32. normals: (n, 3) unit. radius: of the neighbourhood, unit of the points.
-        count: at most so many points make a feature, its own among them.
+        near: distances and rows (n, k) of the nearest points, the point itself first; no more make a feature.
 
     Source: Rusu et al., ICRA 2009, with the conventions of Open3D: the normal that is the steeper to the connection
     comes first, neighbours count by 1 / distance^2, every third of a feature sums to 100 before its own is added.
     """
-    distance, rows = nearest_points(points, points, count)
+    distance, rows = near
     seen = (distance <= radius) & (torch.arange(rows.shape[1], device=rows.device) > 0)
     bins = _bins(points[:, None], normals[:, None], points[rows], normals[rows])
     share = 100.0 / seen.sum(1).clamp_min(1).to(points.dtype)

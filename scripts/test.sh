@@ -28,7 +28,7 @@ install_consumers() {
 }
 
 set_up
-install_package dev,docs,las,e57,train,dask,peers,consumers
+install_package dev,docs,las,e57,images,train,dask,peers,consumers
 install_browser
 install_consumers
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geomoe3d.errors import ConfigError
-from geomoe3d.images.epipolar import LABEL_THRESHOLD, essential_of, symmetric_distance
+from geomoe3d.images.epipolar import essential_of, label_threshold, symmetric_distance
 from geomoe3d.images.generate import ImagePairsConfig, generate_matches, neighbors_of
 from geomoe3d.training.batches import ImagePairs
 from geomoe3d.training.config import load_train_config
@@ -27,18 +27,26 @@ def configuration(*changes):
 
 
 def test_labels_are_those_of_the_true_pose_and_shares_fall_with_the_angle():
-    drawn = generate_matches(ImagePairsConfig(matches=500), 64, 3)
+    drawn = generate_matches(ImagePairsConfig(matches=500, focal_length=(0.6, 0.9)), 64, 3)
     assert drawn.matches.shape == (64, 500, 4)
     assert bool(drawn.matches.isfinite().all())
     torch.testing.assert_close(drawn.truth[:, :3, 3].norm(dim=1), torch.ones(64))
     R = drawn.truth[:, :3, :3]
     torch.testing.assert_close(R @ R.transpose(1, 2), torch.eye(3).expand(64, 3, 3), atol=1e-5, rtol=0)
     far = symmetric_distance(essential_of(drawn.truth.double()), drawn.matches.double())
-    assert torch.equal(far < LABEL_THRESHOLD, drawn.labels)
+    assert torch.equal(far < label_threshold(1.0), drawn.labels)
     angle = torch.rad2deg(torch.arccos(((R.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)))
     share = drawn.labels.float().mean(1)
     assert share[angle < 20].mean() > 1.5 * share[angle > 40].mean()
     assert angle.max() < 65.1
+
+
+def test_labels_of_a_long_lens_are_as_strict_in_pixels():
+    assert label_threshold(2.0).item() == label_threshold(1.0).item() == pytest.approx(1e-4)
+    assert label_threshold(0.5).item() == pytest.approx(0.25e-4)
+    drawn = generate_matches(ImagePairsConfig(matches=500, focal_length=(3.0, 3.0)), 32, 3)
+    assert drawn.matches.abs().max() < 0.2
+    assert 0.02 < drawn.labels.float().mean() < 0.6
 
 
 def test_the_same_seed_draws_the_same_and_another_seed_others():

@@ -13,9 +13,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-LABEL_THRESHOLD = 1e-4
-"""Symmetric squared epipolar distance, normalised units, below which a match is an inlier of the true pose."""
-
 MIN_MATCHES = 8
 _TINY = 1e-15
 _DAMPING = 1e-6
@@ -67,6 +64,19 @@ def symmetric_distance(E: Tensor, matches: Tensor) -> Tensor:
     product = (second * lines1).sum(-1)
     inverse = [1 / (lines[..., :2].square().sum(-1) + _TINY) for lines in (lines1, lines0)]
     return product.square() * (inverse[0] + inverse[1])
+
+
+def label_threshold(side: Tensor | float) -> Tensor:
+    """Symmetric squared epipolar distance, in focal lengths, below which a match is an inlier of the true pose.
+
+    Args:
+        side: longer side of the image, in focal lengths.
+
+    Source:
+        1e-4, as Yi et al. (CVPR 2018) and all who follow; through a lens longer than the image's side, where
+        this would be more than 1 % of that side, it shrinks with the field of view.
+    """
+    return 1e-4 * torch.as_tensor(side).clamp(max=1.0).square()
 
 
 def weighted_eight_point(matches: Tensor, weights: Tensor) -> EssentialFit:

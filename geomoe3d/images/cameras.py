@@ -1,0 +1,126 @@
+"""Pinhole cameras with radial and tangential distortion, and the views of a scene; pixel centres at whole numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.errors import DependencyError, InputError
+from geomoe3d.types import FloatArray
+
+
+def opencv() -> Any:
+    """OpenCV.
+
+    Raises:
+        DependencyError: it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise DependencyError(
+            f"images need OpenCV ({error}); install it with: pip install 'geomoe3d[images]'"
+        ) from None
+    return cv2
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one image.
+
+    Attributes:
+        fx, fy, cx, cy: pixels.
+        distortion: k1, k2, p1, p2 (OpenCV's model), all 0 for an ideal camera.
+        size: width and height in pixels, or None where not known.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not (np.isfinite(values).all() and self.fx > 0 and self.fy > 0):
+            raise InputError(f"intrinsics fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}: focal lengths "
+                             "must be positive, and all of them finite")  # fmt: skip
+
+    @classmethod
+    def guess(cls, width: int, height: int) -> Camera:
+        """Of an unknown camera: the middle of the image, and a focal length of its longer side."""
+        return cls(
+            max(width, height), max(width, height), (width - 1) / 2, (height - 1) / 2, size=(width, height)
+        )
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(3, 3)."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def focal(self) -> float:
+        """Pixels that one focal length is worth, mean of both axes."""
+        return (self.fx + self.fy) / 2
+
+    def side(self, pixels: FloatArray) -> float:
+        """Longer side of the image in focal lengths; without a known size the extent of pixels (N, 2)."""
+        longer = max(self.size) if self.size is not None else float(np.ptp(pixels, axis=0).max())
+        return longer / self.focal
+
+    def normalise(self, pixels: FloatArray) -> FloatArray:
+        """Pixels (N, 2) to rays (N, 2), x = (u - c) / f with the distortion undone."""
+        if any(self.distortion) and len(pixels):
+            points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None]
+            undone: FloatArray = opencv().undistortPoints(points, self.matrix, np.array(self.distortion))[
+                :, 0
+            ]
+            return undone
+        return (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph of a scene.
+
+    Attributes:
+        path: of the image.
+        camera: its intrinsics.
+        T_camera_world: (4, 4), X_camera = R X_world + t; x right, y down, z forward.
+    """
+
+    path: Path
+    camera: Camera
+    T_camera_world: FloatArray
+
+
+@dataclass(frozen=True)
+class ImageScene:
+    """Photographs with known cameras.
+
+    Attributes:
+        name: of its folder.
+        layout: which reader understood it.
+        views: in the order of the file.
+        notes: what was left out, and why.
+    """
+
+    name: str
+    layout: str
+    views: tuple[View, ...]
+    notes: tuple[str, ...] = field(default=())
+
+
+def relative_pose(first: View, second: View) -> FloatArray:
+    """(4, 4) that maps the first camera's frame into the second's; t in the unit of the scene."""
+    T: FloatArray = second.T_camera_world @ np.linalg.inv(first.T_camera_world)
+    return T
+
+
+def rotation_deg(T: FloatArray) -> float:
+    """Angle of rotation of (4, 4)."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))))

@@ -1,0 +1,251 @@
+"""Readers of photographs with known cameras, each of a published layout, told apart by their files.
+
+transforms.json (instant-ngp, nerfstudio), LLFF's poses_bounds.npy, KITTI odometry (calib.txt, poses.txt), COLMAP's
+text and binary models, Middlebury's NAME_par.txt. All give OpenCV's camera frame: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomoe3d.errors import FormatError, InputError, MissingFileError
+from geomoe3d.geometry.se3 import inverse, make_transform
+from geomoe3d.images.cameras import Camera, ImageScene, View, rotation_deg
+from geomoe3d.types import FloatArray
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".tif", ".tiff")
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL's camera (y up, z backwards) to OpenCV's."""
+
+
+def read_scene(folder: str | Path) -> ImageScene:
+    """The photographs of a folder with their cameras.
+
+    Raises:
+        MissingFileError: no such folder.
+        InputError: it has none of the known layouts, or fewer than two views with an image.
+        FormatError: a file of the layout is damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise MissingFileError(f"no folder '{folder}' of photographs")
+    found = layout_of(folder)
+    if found is None:
+        raise InputError(
+            f"'{folder}' holds no photographs with cameras: none of transforms.json, poses_bounds.npy, "
+            "poses.txt with calib.txt, cameras.txt or .bin with images.txt or .bin, *_par.txt is there"
+        )
+    layout, file = found
+    try:
+        views = list(_READERS[layout](folder, file))
+    except InputError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
+        raise FormatError(f"'{file}' is damaged, or no file of the layout {layout}: {error}") from None
+    there = [view for view in views if view.path.is_file()]
+    notes = (
+        [f"{len(views) - len(there)} of {len(views)} views have no image"] if len(there) < len(views) else []
+    )
+    if len(there) < 2:
+        raise InputError(f"'{folder}' ({layout}) has {len(there)} views with an image; at least 2 are needed")
+    return ImageScene(folder.name, layout, tuple(there), tuple(notes))
+
+
+def layout_of(folder: Path) -> tuple[str, Path] | None:
+    """Name of the layout and its main file, or None."""
+    for layout, name in (
+        ("transforms", "transforms.json"),
+        ("llff", "poses_bounds.npy"),
+        ("kitti", "poses.txt"),
+    ):
+        if (file := folder / name).is_file() and (layout != "kitti" or (folder / "calib.txt").is_file()):
+            return layout, file
+    for place in (folder, folder / "sparse", folder / "sparse" / "0"):
+        for suffix in (".bin", ".txt"):
+            if (place / f"cameras{suffix}").is_file() and (file := place / f"images{suffix}").is_file():
+                return "colmap", file
+    for file in sorted(folder.glob("*_par.txt")):
+        return "middlebury", file
+    return None
+
+
+def choose_pairs(
+    scene: ImageScene, angles: tuple[float, float], count: int, seed: int = 0
+) -> list[tuple[int, int]]:
+    """At most ``count`` pairs of views whose rotation lies in [least, most) degrees, drawn at random, in order."""
+    T = [view.T_camera_world for view in scene.views]
+    pairs = [
+        (i, j)
+        for i in range(len(T))
+        for j in range(i + 1, len(T))
+        if angles[0] <= rotation_deg(T[j] @ inverse(T[i])) < angles[1]
+        and np.linalg.norm((T[j] @ inverse(T[i]))[:3, 3]) > 0
+    ]
+    chosen = np.random.default_rng(seed).permutation(len(pairs))[:count]
+    return [pairs[k] for k in sorted(chosen)]
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Image files of a folder by name; numbers in names count as numbers."""
+    import re
+
+    def key(path: Path) -> list[Any]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+    if not folder.is_dir():
+        raise MissingFileError(f"no folder '{folder}' of images")
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=key)
+
+
+def _transforms(folder: Path, file: Path) -> Iterator[View]:
+    data = json.loads(file.read_text(encoding="utf-8"))
+    for frame in data["frames"]:
+        given = {**data, **frame}
+        path = folder / given["file_path"]
+        path = path if path.suffix else path.with_suffix(".png")
+        width, height = (given["w"], given["h"]) if "w" in given else _size(path)
+        angle = given.get("camera_angle_x")
+        fx = given["fl_x"] if "fl_x" in given else 0.5 * width / np.tan(0.5 * float(angle))
+        camera = Camera(
+            float(fx), float(given.get("fl_y", fx)),
+            float(given.get("cx", width / 2)) - 0.5, float(given.get("cy", height / 2)) - 0.5,
+            tuple(float(given.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2")),  # type: ignore[arg-type]
+            (int(width), int(height)),
+        )  # fmt: skip
+        yield View(path, camera, inverse(_matrix(given["transform_matrix"]) @ _FLIP))
+
+
+def _llff(folder: Path, file: Path) -> Iterator[View]:
+    rows = np.load(file, allow_pickle=False)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise FormatError(f"'{file}' must have shape (N, 17), found {rows.shape}")
+    images = sorted(images_in(folder / "images"))  # 10 before 2, as LLFF counts
+    if len(images) != len(rows):
+        raise InputError(
+            f"'{file}' has {len(rows)} poses, but '{folder / 'images'}' has {len(images)} images"
+        )
+    for path, row in zip(images, rows, strict=True):
+        given = row[:15].reshape(3, 5)
+        # Columns: down, right, backwards, place, and (height, width, focal length).
+        R = np.stack([given[:, 1], given[:, 0], -given[:, 2]], axis=1)
+        height, width, f = given[:, 4]
+        camera = Camera(f, f, (width - 1) / 2, (height - 1) / 2, size=(int(width), int(height)))
+        yield View(path, camera, inverse(make_transform(R, given[:, 3])))
+
+
+def _kitti(folder: Path, file: Path) -> Iterator[View]:
+    first = (folder / "calib.txt").read_text().splitlines()[0].split(":")[-1]
+    P = np.array(first.split(), dtype=np.float64).reshape(3, 4)
+    place = next(
+        (folder / n for n in ("image_0", "image_2", "image_l", "images") if (folder / n).is_dir()), folder
+    )
+    camera = Camera(P[0, 0], P[1, 1], P[0, 2], P[1, 2])
+    poses = np.loadtxt(file, ndmin=2)
+    if poses.shape[1] != 12:
+        raise FormatError(f"'{file}' must have 12 numbers per line, found {poses.shape[1]}")
+    for path, row in zip(images_in(place), poses, strict=False):
+        yield View(path, camera, inverse(np.vstack([row.reshape(3, 4), [0, 0, 0, 1]])))
+
+
+_MODELS: dict[str, tuple[int, Callable[..., Camera]]] = {
+    "SIMPLE_PINHOLE": (3, lambda f, x, y: Camera(f, f, x, y)),
+    "PINHOLE": (4, lambda f, g, x, y: Camera(f, g, x, y)),
+    "SIMPLE_RADIAL": (4, lambda f, x, y, k: Camera(f, f, x, y, (k, 0.0, 0.0, 0.0))),
+    "RADIAL": (5, lambda f, x, y, k, m: Camera(f, f, x, y, (k, m, 0.0, 0.0))),
+    "OPENCV": (8, lambda f, g, x, y, k, m, p, q: Camera(f, g, x, y, (k, m, p, q))),
+}
+"""Number of parameters of COLMAP's first camera models, in the order of their numbers, and the camera of them."""
+
+
+def _colmap(folder: Path, file: Path) -> Iterator[View]:
+    read = _colmap_binary if file.suffix == ".bin" else _colmap_text
+    cameras, images = read(file.with_name(f"cameras{file.suffix}"), file)
+    root = folder / "images" if (folder / "images").is_dir() else folder
+    made = {}
+    for number, (model, width, height, values) in cameras.items():
+        if model not in _MODELS:
+            known = ", ".join(_MODELS)
+            raise FormatError(
+                f"'{file}': camera model {model} is not read; undistort the images, or use {known}"
+            )
+        ideal = _MODELS[model][1](*values)
+        made[number] = Camera(
+            ideal.fx, ideal.fy, ideal.cx - 0.5, ideal.cy - 0.5, ideal.distortion, (width, height)
+        )  # COLMAP counts from the corner of the first pixel
+    for name, camera, q, t in sorted(images, key=lambda one: one[0]):
+        R = Rotation.from_quat([q[1], q[2], q[3], q[0]]).as_matrix()
+        yield View(root / name, made[camera], make_transform(R, t))
+
+
+def _colmap_text(cameras: Path, images: Path) -> tuple[dict[int, Any], list[Any]]:
+    found = {}
+    for line in cameras.read_text(encoding="utf-8").splitlines():
+        if line.strip() and not line.startswith("#"):
+            number, model, width, height, *values = line.split()
+            found[int(number)] = (model, int(width), int(height), [float(v) for v in values])
+    lines = [line for line in images.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    views = []
+    for line in lines[::2]:  # every other line lists the image's points
+        if line.strip():
+            words = line.split(maxsplit=9)
+            numbers = [float(word) for word in words[1:8]]
+            views.append((words[9].strip(), int(words[8]), numbers[:4], np.array(numbers[4:])))
+    return found, views
+
+
+def _colmap_binary(cameras: Path, images: Path) -> tuple[dict[int, Any], list[Any]]:
+    data, at = cameras.read_bytes(), 8
+    found = {}
+    names = list(_MODELS)
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        if not 0 <= model < len(names):
+            raise FormatError(f"'{cameras}': camera model {model} is not read; undistort the images first")
+        count = _MODELS[names[model]][0]
+        found[number] = (names[model], width, height, struct.unpack_from(f"<{count}d", data, at + 24))
+        at += 24 + 8 * count
+    data, at = images.read_bytes(), 8
+    views = []
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        _, *numbers, camera = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        views.append((data[at + 64 : end].decode(), camera, numbers[:4], np.array(numbers[4:])))
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+    return found, views
+
+
+def _middlebury(folder: Path, file: Path) -> Iterator[View]:
+    for line in file.read_text(encoding="utf-8").splitlines()[1:]:
+        if line.strip():
+            name, *words = line.split()
+            numbers = np.array(words, dtype=np.float64)
+            K, R, t = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:21]
+            camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+            yield View(folder / name, camera, make_transform(R, t))
+
+
+_READERS: dict[str, Callable[[Path, Path], Iterator[View]]] = {
+    "transforms": _transforms, "llff": _llff, "kitti": _kitti, "colmap": _colmap, "middlebury": _middlebury,
+}  # fmt: skip
+
+
+def _matrix(rows: Any) -> FloatArray:
+    T = np.array(rows, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"a transform_matrix must hold 4 x 4 finite numbers, found shape {T.shape}")
+    return T
+
+
+def _size(path: Path) -> tuple[int, int]:
+    from geomoe3d.images.features import read_grey
+
+    height, width = read_grey(path).shape
+    return width, height

@@ -111,8 +111,7 @@ def _transforms(folder: Path, file: Path) -> Iterator[View]:
         path = folder / given["file_path"]
         path = path if path.suffix else path.with_suffix(".png")
         width, height = (given["w"], given["h"]) if "w" in given else _size(path)
-        angle = given.get("camera_angle_x")
-        fx = given["fl_x"] if "fl_x" in given else 0.5 * width / np.tan(0.5 * float(angle))
+        fx = given["fl_x"] if "fl_x" in given else 0.5 * width / np.tan(0.5 * float(given["camera_angle_x"]))
         camera = Camera(
             float(fx), float(given.get("fl_y", fx)),
             float(given.get("cx", width / 2)) - 0.5, float(given.get("cy", height / 2)) - 0.5,

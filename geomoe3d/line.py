@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.remarks import data_remarks, remarks
 from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
+from geomoe3d.features.base import mirrored
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
 from geomoe3d.runtime.threads import single_blas_thread
@@ -46,13 +48,6 @@ class Look(NamedTuple):
     decision: Decision
 
 
-class Again(NamedTuple):
-    """Registers two clouds at the scale that they have, to find what is wrong with a pair: with all looks, with one."""
-
-    fully: Register
-    quickly: Register
-
-
 @dataclass
 class Line:
     """What becomes of one pair.
@@ -63,7 +58,7 @@ class Line:
         clock: told of the stages.
         initial: a user's first guess (4, 4), file coordinates, or None.
         given: (N, 6) a user's own matches, file coordinates, which then take the place of ours, or None.
-        again: asked for what is wrong with a pair that is not ok; None: that is not asked.
+        again: registers two clouds, to find what is wrong with a pair that is not ok; None: that is not asked.
         once: whether the first look is all.
     """
 
@@ -72,7 +67,7 @@ class Line:
     clock: StageClock
     initial: FloatArray | None = None
     given: FloatArray | None = None
-    again: Again | None = None
+    again: Register | None = None
     once: bool = False
 
     def explain(
@@ -100,7 +95,12 @@ class Line:
                 return self._in_map(clouds[::-1], back).exchanged()
             wanted = round_size(max(sizes))
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
-        look, believed = self._best(clouds, voxel_size)
+        rule = config.preparation.viewpoint
+        views = find_viewpoints(*clouds, rule)
+        prepared = self.pipeline.prepare_both(clouds, voxel_size, views, clock)
+        # Known places, not guessed ones: the network was trained on true ones, or none.
+        places = known_viewpoints(*clouds, rule)
+        look = self._best(clouds, prepared, places)
         clock("decide")
         decision = look.decision
         if decision.answer is not None:
@@ -110,33 +110,49 @@ class Line:
             units = self._units(clouds[::-1] if exchanged else clouds)
             decision = decision if units is None else decision.with_note(units, first=True)
         if config.second_look.mirror and self.again is not None:
-            mirrored = mirrored_axes(clouds, decision, self.again.quickly, clock)
+            mirrored = self._mirrored(prepared, places, decision)
             decision = decision if mirrored is None else decision.doubted(mirrored)
-        told_of = remarks(data, look.pair.clouds, wanted, believed, config.preparation, decision.judgement)
+        told_of = remarks(
+            data, look.pair.clouds, wanted, places is not None, config.preparation, decision.judgement
+        )
         causes = () if decision.judgement.status == "ok" else data_remarks(clouds, wanted, config.preparation)
         for remark in (*clouds[0].notes, *clouds[1].notes, *causes, *told_of):
             decision = decision.with_note(remark)
         return self._finished(look._replace(decision=decision), clouds)
 
-    def _best(self, clouds: tuple[PointCloud, PointCloud], voxel_size: float) -> tuple[Look, bool]:
-        """The surest look at two clouds on a grid, and whether the places of the sensors were believed."""
-        rule = self.config.preparation.viewpoint
-        views = find_viewpoints(*clouds, rule)
-        prepared = self.pipeline.prepare_both(clouds, voxel_size, views, self.clock)
-        # Known places, not guessed ones: the network was trained on true ones, or none.
-        places = known_viewpoints(*clouds, rule)
+    def _best(self, clouds: tuple[PointCloud, PointCloud], prepared: Clouds, places: Places) -> Look:
+        """The surest look at two clouds, prepared with their sensors at ``places``, believed ones or None."""
         best = self._look(prepared, places)
-        for sides in self._other_sides(prepared, places):
-            if best.decision.judgement.status == "ok":
-                break
+        others = self._other_sides(prepared, places)
+        while best.decision.judgement.status != "ok" and (sides := next(others, None)) is not None:
             if sides == "centroid":
-                prepared = self.pipeline.prepare_both(clouds, voxel_size, (None, None), self.clock, sides)
+                size = prepared[0].voxel_size
+                prepared = self.pipeline.prepare_both(clouds, size, (None, None), self.clock, sides)
             other = self._look(prepared, None, sides, best.decision)
             surer = other.decision.judgement.confidence > best.decision.judgement.confidence
             # Without sensors less speaks against a wrong answer, so it is taken only where it is sure.
             if surer and (sides == "flipped" or other.decision.judgement.status == "ok"):
                 best = other
-        return best, places is not None
+        return best
+
+    def _mirrored(self, prepared: Clouds, places: Places, decision: Decision) -> str | None:
+        """A sentence where the clouds fit clearly better with the source mirrored; see `mirrored_axes`."""
+        describe, clock = self.pipeline.descriptor, StageClock()
+
+        @cache
+        def pair() -> tuple[Clouds, Places]:
+            source, target = mirrored(prepared[0], describe), prepared[1]
+            believed = None if places is None or source.viewpoint is None else (source.viewpoint, places[1])
+            return (source, target), believed
+
+        def agreeing() -> float:
+            return self.pipeline.agreeing(*pair(), clock)
+
+        def look() -> Decision:
+            alone = replace(self, clock=clock, initial=None, given=None, again=None, once=True)
+            return alone._look(*pair()).decision
+
+        return mirrored_axes(decision, prepared[0].name, agreeing, look, self.clock)
 
     def _look(
         self,
@@ -239,7 +255,7 @@ class Line:
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
     def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
-        return None if self.again is None else differing_units(clouds, self.again.fully, self.clock)
+        return None if self.again is None else differing_units(clouds, self.again, self.clock)
 
     def _is_map(self, sizes: tuple[float, float]) -> bool:
         """Whether one cloud is so much larger or sparser than the other that what both share is a small part of it."""

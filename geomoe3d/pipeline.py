@@ -28,6 +28,7 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import Scorer, make_scorers, scorer
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
+_FEW_MATCHES = 500
 _LINE = ("geomoe3d.registration", "geomoe3d.line", "geomoe3d.correspondence_registration")
 
 
@@ -152,6 +153,13 @@ class Pipeline:
         weighed = self.weigh(pair)
         clock("propose")
         return weighed, propose(self.estimator, pair, weighed.weights, self.config.estimator)
+
+    def agreeing(self, clouds: Clouds, places: Places, clock: StageClock) -> float:
+        """Which share of some hundred matches the best of a few motions brings together; a look with least effort."""
+        pair = self.match(clouds, places, clock, _FEW_MATCHES)
+        quick = self.estimator.with_least_effort()
+        found = propose(quick, pair, np.ones(len(pair.matched)), self.config.estimator)
+        return max((h.proposal_score for h in found), default=0.0) / max(len(pair.matched), 1)
 
     def flipped(self, clouds: Clouds, clock: StageClock) -> Clouds:
         """Both clouds with the normals of the first turned over, and without sensors."""

@@ -30,7 +30,7 @@ from geomoe3d.decision.similarity import explain_similarity
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.features.cache import FeatureCache
 from geomoe3d.geometry.se3 import check_motion, inverse
-from geomoe3d.line import Again, Line
+from geomoe3d.line import Line
 from geomoe3d.pipeline import Pipeline, resolved, with_weights
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.timing import Progress, StageClock
@@ -159,10 +159,10 @@ class Registrar:
             found = explain_similarity(loaded, rows, config, quick, thorough, clock, progress)
             return found.remembering(source, target)
         asks_causes = self._names_units and bool(self.pipeline.scorers)
-        again = Again(self.register, self._rigid(second_look=False).register) if asks_causes else None
+        again = self.register if asks_causes else None
         mismatch = scale_mismatch(*clouds)
         if mismatch is not None:
-            units = None if again is None else differing_units(clouds, again.fully, clock)
+            units = None if again is None else differing_units(clouds, again, clock)
             failed = failed_result(clouds, units or mismatch, config, clock.stop())
             return Explanation(failed, *loaded).remembering(source, target)
         exchanged = not in_order(*clouds)

@@ -8,6 +8,7 @@ the cloud's float64 ``origin``. Everything between loading and the result works 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -87,6 +88,13 @@ class PreparedCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def tree(self) -> Any:
+        """scipy's k-d tree of the points, made when it is first asked for and shared by all who ask after."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
 @dataclass(frozen=True)

@@ -97,9 +97,7 @@ def _sensor_may_be_at_origin(cloud: PointCloud) -> bool:
 
 def sign_breaks(cloud: PreparedCloud) -> float:
     """Share of neighbours on one smooth surface whose normals are turned to opposite sides, in [0, 1]."""
-    from scipy.spatial import cKDTree
-
-    distance, near = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False).query(cloud.points, k=7)
+    distance, near = cloud.tree.query(cloud.points, k=7)
     rows, others = np.repeat(np.arange(len(cloud.points)), 6), np.asarray(near)[:, 1:].ravel()
     close = np.asarray(distance)[:, 1:].ravel() < 2.5 * cloud.voxel_size
     cosine = np.einsum("ij,ij->i", cloud.normals[rows[close]], cloud.normals[others[close]])

@@ -48,6 +48,7 @@ class SharedSurfaceExpert(Section):
         0.7, "cosine", (0, 1), "normals of one surface, estimated twice, differ by less than 45 degrees"
     )
     most_asked: int = constant(4000, "points", (100, 1_000_000), "of each cloud that are looked at")
+    few_asked: int = constant(800, "points", (100, 1_000_000), "of each cloud in the first rounds of a fit")
     cut: float = constant(4.0, "robust deviations", (1, 100), "gaps beyond count for nothing")
     least_deviation: float = constant(
         0.05, "voxels", (0, 1), "least robust deviation of gaps: means of a grid are no better"
@@ -92,6 +93,8 @@ class ScaleExpert(Section):
         None,
         "how far nearest neighbours are sought from round to round, wide enough at first for a scale of 0.8",
     )
+    thorough_rounds: int = constant(4, "rounds", (1, 100), "the last ones, which ask all points")
+    settled: float = constant(2e-4, "ln(ratio)", (0, 0.1), "a change that ends them")
     least_points: int = constant(60, "points", (7, 100_000), "on each other, for seven unknowns")
     smallest: float = constant(0.3, "ratio", (0.01, 1), "a fit that shrinks the source further has run away")
     largest: float = constant(3.0, "ratio", (1, 100), "a fit that grows the source further has run away")
@@ -153,6 +156,13 @@ class CausesExpert(Section):
         "most confidence of an answer whose scale differs or whose source is mirrored",
     )
     sure: float = constant(0.99, "probability", (0, 1), "an ok answer above it is not tried mirrored")
+    mirrored_support: float = constant(
+        0.028,
+        "votes per match",
+        (0, 1),
+        "of the best of a few motions, below which no mirrored source is looked at",
+        "0.012 to 0.028 by chance, and 0.036 to 0.15 of mirrored pairs that fit, among 31 recorded pairs",
+    )
     mirrored_lead: float = constant(
         3.0, "ratio of scores", (1, 1000), "by which a mirrored source must fit better"
     )

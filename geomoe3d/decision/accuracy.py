@@ -19,6 +19,7 @@ from geomoe3d.decision.shared_surface import (
     robust_weights,
     solved,
 )
+from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.se3 import cross_matrix, residuals, transform_points
 from geomoe3d.result import Accuracy
 from geomoe3d.types import Correspondences, FloatArray, PreparedCloud
@@ -78,7 +79,7 @@ def _covariance(contact: Contact, center: FloatArray, voxel_size: float) -> tupl
     radius = max(float(np.sqrt(np.mean(np.sum(offsets**2, axis=1)))), 1e-9 * voxel_size)
     X, normals, gaps = offsets / radius, contact.normals, contact.gaps
     weights = robust_weights(gaps, voxel_size)
-    _, inverse, variance = solved(np.hstack([np.cross(X, normals), normals]), gaps, weights)
+    _, inverse, variance = solved(np.hstack([crossed(X, normals), normals]), gaps, weights)
     strain = distortion_of(X, normals, gaps, weights, radius)
     bent = (strain / (strain + known.small_strain)) ** 2
     of_one = variance * float(weights.sum()) * inverse

@@ -12,7 +12,7 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.confidence import Information, Judgement
 from geomoe3d.decision.scale import Scale
-from geomoe3d.geometry.se3 import motions_apart, residuals, shift_frames, transform_points
+from geomoe3d.geometry.se3 import inverse, motions_apart, residuals, shift_frames, transform_points
 from geomoe3d.result import Accuracy, Alternative, CloudReport, RegistrationResult, Status
 from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
@@ -206,11 +206,9 @@ def _evidence(decision: Decision, pair: Pair) -> dict[str, float]:
 
 def _overlap_target(T_target_source: FloatArray, pair: Pair) -> float:
     """Share of the target's points with a source point within the threshold."""
-    from scipy.spatial import cKDTree
-
     source, target = pair.clouds
-    tree = cKDTree(transform_points(T_target_source, source.points), balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(target.points, distance_upper_bound=pair.inlier_threshold)
+    back = transform_points(inverse(T_target_source), target.points)
+    distance, _ = source.tree.query(back, distance_upper_bound=pair.inlier_threshold)
     return float(np.isfinite(distance).mean())
 
 

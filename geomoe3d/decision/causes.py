@@ -1,4 +1,4 @@
-"""What is wrong with a pair as a whole, found by one more registration: units that differ, axes that are mirrored."""
+"""What is wrong with a pair as a whole, found by one more look: units that differ, axes that are mirrored."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from geomoe3d.clouds.prepare import robust_extent
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.scale import likely_unit_ratio, seeming_units
-from geomoe3d.decision.similarity import mirrored_cloud, scaled_cloud
+from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.timing import StageClock
@@ -44,22 +44,37 @@ def differing_units(
 
 
 def mirrored_axes(
-    clouds: tuple[PointCloud, PointCloud], decision: Decision, register: Register, clock: StageClock
+    decision: Decision,
+    name: str,
+    agreeing: Callable[[], float],
+    look: Callable[[], Decision],
+    clock: StageClock,
 ) -> str | None:
     """A sentence where the clouds fit clearly better once the source is mirrored, else None.
 
-    Nothing is registered where the answer is quite sure.
+    Nothing is asked where the answer is quite sure.
+
+    Args:
+        decision: about the clouds as they are.
+        name: of the source.
+        agreeing: which share of matches of the mirrored source the best of a few motions brings together.
+        look: decides about the mirrored source; asked only where that share is more than chance gives.
+        clock: told of the stage.
     """
-    judgement = decision.judgement
-    if judgement.status == "ok" and judgement.confidence > expert().causes.sure:
+    judgement, known = decision.judgement, expert().causes
+    if judgement.status == "ok" and judgement.confidence > known.sure:
         return None
     clock("mirrored")
-    found = register(mirrored_cloud(clouds[0]), clouds[1])
+    if agreeing() < known.mirrored_support:
+        return None
+    found = look()
     score = 0.0 if decision.answer is None else decision.answer.score
-    if not found.ok or found.evidence["score"] < expert().causes.mirrored_lead * score:
+    if found.judgement.status != "ok" or found.answer is None:
+        return None
+    if found.answer.score < known.mirrored_lead * score:
         return None
     return (
-        f"mirrored: with x of '{clouds[0].name}' the other way round the clouds fit (confidence "
-        f"{found.confidence:.2f}); a rigid motion cannot mirror, so bring both to right-handed axes (often two "
-        "axes are exchanged)"
+        f"mirrored: with x of '{name}' the other way round the clouds fit (confidence "
+        f"{found.judgement.confidence:.2f}); a rigid motion cannot mirror, so bring both to right-handed axes (often "
+        "two axes are exchanged)"
     )

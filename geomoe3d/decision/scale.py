@@ -3,7 +3,8 @@
 Place: after decide. A rigid motion hides a difference of scale in its residuals, and where that is a few per cent
 the clouds still lie on each other well enough to be believed. Scans are no rigid bodies either: what a depth
 camera fuses is bent by a per cent or two. So the ratio is given with an uncertainty that is read from the same
-surfaces: how differently they stretch along different directions, which no scale explains. About 40 ms.
+surfaces: how differently they stretch along different directions, which no scale explains. The first rounds ask few
+points, the last ones all, until they change nothing: about 13 ms.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.decision.shared_surface import SharedSurface, distortion_of, robust_weights, solved
+from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray, PreparedCloud
 
@@ -69,9 +71,14 @@ def measure_scale(T_target_source: FloatArray, source: PreparedCloud, target: Pr
         None where too few points lie on each other, or the fit runs away.
     """
     fit = _Fit(T_target_source, source, target)
-    for reach in expert().scale.reaches:
-        if not fit.step(reach * source.voxel_size):
+    known = expert().scale
+    begun = len(known.reaches) - known.thorough_rounds
+    for number, reach in enumerate(known.reaches):
+        growth = fit.step(reach * source.voxel_size, few=number < begun)
+        if growth is None:
             return None
+        if number >= begun and abs(growth) < known.settled:
+            break
     return Scale(float(1 / fit.scale), fit.deviation())
 
 
@@ -82,25 +89,30 @@ class _Fit:
         self.scale, self._R, self._t = 1.0, T[:3, :3], T[:3, 3]
         self._shared, self._voxel = SharedSurface(source, target), source.voxel_size
 
-    def step(self, reach: float) -> bool:
-        """One linear solution; False where too little matches or the scale leaves what is sought."""
+    def step(self, reach: float, *, few: bool = False) -> float | None:
+        """One linear solution; by how much the scale grew, None where too little matches or it leaves what is sought.
+
+        ``few``: of few points, of which a quarter as many must match.
+        """
         from scipy.spatial.transform import Rotation
 
-        contact = self._shared.contact(make_transform(self._R, self._t), reach, self.scale)
+        contact = self._shared.contact(make_transform(self._R, self._t), reach, self.scale, few=few)
         points, normals, gaps = contact.points, contact.normals, contact.gaps
-        if len(points) < 2 * expert().scale.least_points:
-            return False
+        least = expert().scale.least_points
+        if len(points) < (least // 2 if few else 2 * least):
+            return None
         weights = robust_weights(gaps, self._voxel)
         center = points.mean(0)
         self._radius = float(np.sqrt(np.mean(np.sum((points - center) ** 2, axis=1))))
         self._rows = (points - center) / self._radius, normals, gaps, weights
         X = self._rows[0]
-        J = np.hstack([np.cross(X, normals), normals, np.einsum("ij,ij->i", X, normals)[:, None]])
+        J = np.hstack([crossed(X, normals), normals, np.einsum("ij,ij->i", X, normals)[:, None]])
         x, self._inverse, self._variance = solved(J, gaps, weights)
         growth, turn = 1 + x[6] / self._radius, Rotation.from_rotvec(x[:3] / self._radius).as_matrix()
         self._t = center + growth * turn @ (self._t - center) + x[3:6]
         self._R, self.scale = turn @ self._R, self.scale * growth
-        return expert().scale.smallest < self.scale < expert().scale.largest
+        known = expert().scale
+        return x[6] / self._radius if known.smallest < self.scale < known.largest else None
 
     def deviation(self) -> float:
         """One standard deviation of ln(scale), from the distortion that is left and from the fit."""

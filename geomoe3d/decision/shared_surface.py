@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.config import expert
+from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
@@ -37,22 +38,25 @@ class SharedSurface:
     """Asks two clouds on one grid where they lie on each other."""
 
     def __init__(self, source: PreparedCloud, target: PreparedCloud) -> None:
-        from scipy.spatial import cKDTree
-
         self._clouds = source, target
-        self._trees = tuple(cKDTree(cloud.points) for cloud in self._clouds)
-        most = expert().shared_surface.most_asked
-        self._asked = tuple(drawn_rows(c.points, c.voxel_size, most) for c in self._clouds)
+        known = expert().shared_surface
+        self._asked, self._few = (
+            tuple(drawn_rows(cloud.points, cloud.voxel_size, most) for cloud in self._clouds)
+            for most in (known.most_asked, known.few_asked)
+        )
 
-    def contact(self, T_target_source: FloatArray, reach: float, scale: float = 1.0) -> Contact:
+    def contact(
+        self, T_target_source: FloatArray, reach: float, scale: float = 1.0, *, few: bool = False
+    ) -> Contact:
         """Points within ``reach``, cloud units, whose normals agree up to sign, under a similarity.
 
         Args:
             T_target_source: (4, 4) rigid part R, t of p_target = scale R p_source + t.
             reach: largest distance of points, in the target's units.
             scale: of the similarity.
+            few: asks fewer points of each cloud.
         """
-        (source, target), (rows, back_rows) = self._clouds, self._asked
+        (source, target), (rows, back_rows) = self._clouds, self._few if few else self._asked
         R, t = T_target_source[:3, :3], T_target_source[:3, 3]
         moved, turned = source.points @ (scale * R).T + t, source.normals @ R.T
         ours, theirs = self._nearest(1, moved[rows], reach)
@@ -68,7 +72,7 @@ class SharedSurface:
 
     def _nearest(self, which: int, points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
         """Rows of the points that have a point of a cloud within reach, and the rows of those."""
-        distance, nearest = map(np.asarray, self._trees[which].query(points, distance_upper_bound=reach))
+        distance, nearest = map(np.asarray, self._clouds[which].tree.query(points, distance_upper_bound=reach))
         found = np.flatnonzero(np.isfinite(distance))
         return found, nearest[found]
 
@@ -93,7 +97,7 @@ def distortion_of(
     """
     (x, y, z), (u, v, w) = X.T, normals.T
     strain = np.stack([x * u, y * v, z * w, x * v + y * u, x * w + z * u, y * w + z * v], axis=1)
-    fitted, _, _ = solved(np.hstack([np.cross(X, normals), normals, strain]), gaps, weights)
+    fitted, _, _ = solved(np.hstack([crossed(X, normals), normals, strain]), gaps, weights)
     xx, yy, zz, xy, xz, yz = fitted[6:] / radius
     E = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return float(np.linalg.norm(E - np.trace(E) / 3 * np.eye(3)))

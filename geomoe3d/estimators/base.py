@@ -35,6 +35,10 @@ class Estimator(Part):
         """The same where every proposal is drawn closer by others before it is scored; here itself."""
         return self
 
+    def with_least_effort(self) -> Self:
+        """The same where only whether there is anything at all is asked; here itself."""
+        return self
+
     @abstractmethod
     def __call__(
         self,

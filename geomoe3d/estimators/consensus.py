@@ -85,6 +85,10 @@ class ConsensusEstimator(Estimator):
         """Fewer seeds, and fewer proposals refined: what is drawn closer need not be proposed so well."""
         return replace(self, num_seeds=500, num_refined=60)
 
+    def with_least_effort(self) -> Self:
+        """See `Estimator`."""
+        return replace(self, num_hypotheses=3, num_seeds=150, num_refined=15)
+
     @single_blas_thread()
     def __call__(
         self,

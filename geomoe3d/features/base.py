@@ -40,6 +40,11 @@ class Descriptor(Part):
         """The same of a cloud that holds the features of another descriptor, which may save work."""
         return self(cloud)
 
+    def mirrored(self, features: Float32Array) -> Float32Array | None:
+        """What the features (n, ``dimension``) of a cloud become where it is mirrored, its normals with it; None where
+        that cannot be told from the features."""
+        return None
+
 
 descriptor: Registry[Descriptor] = Registry("descriptor", "geomoe3d.features", lambda: Descriptor)
 """Decorator by which a descriptor joins, and the choice by name."""
@@ -74,3 +79,17 @@ def with_normals_flipped(cloud: PreparedCloud, describe: Descriptor) -> Prepared
     """The cloud as if its sensor had stood on the other side of every surface: no sensor, features anew."""
     flipped = replace(cloud, normals=-cloud.normals, viewpoint=None)
     return with_features(flipped, describe) if describe.needs_normals else flipped
+
+
+def mirrored(cloud: PreparedCloud, describe: Descriptor) -> PreparedCloud:
+    """The cloud with x the other way round, and its sensor with it."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    turned = replace(
+        cloud,
+        points=flip * cloud.points,
+        normals=flip * cloud.normals,
+        features=None if cloud.features is None else describe.mirrored(cloud.features),
+        viewpoint=None if cloud.viewpoint is None else flip * cloud.viewpoint,
+        origin=flip * cloud.origin,
+    )
+    return turned if turned.features is not None else with_features(turned, describe)

@@ -59,3 +59,10 @@ class FpfhDescriptor(Descriptor):
         features = np.where(np.isfinite(features), features, np.float32(0))
         features /= np.linalg.norm(features, axis=1, keepdims=True) + np.float32(1e-6)
         return np.ascontiguousarray(features)
+
+    def mirrored(self, features: Float32Array) -> Float32Array:
+        """See `Descriptor`. Of the three angles between two points' frames only the one with the axis that is a cross
+        product changes its sign, so the second of the three histograms is turned round."""
+        histograms = features.reshape(len(features), 3, -1).copy()
+        histograms[:, 1] = histograms[:, 1, ::-1]
+        return histograms.reshape(features.shape)

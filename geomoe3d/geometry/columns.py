@@ -37,3 +37,9 @@ def finite_rows(points: FloatArray) -> BoolArray:
     for column in points.T[1:]:
         finite &= np.isfinite(column)
     return finite
+
+
+def crossed(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(N, 3) cross products of the rows of two arrays (N, 3)."""
+    (x, y, z), (u, v, w) = a.T, b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)

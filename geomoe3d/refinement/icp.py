@@ -9,13 +9,13 @@ again. Lengths are passed in voxels, because small_gicp's stopping rule is an ab
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RefinementConfig
-from geomoe3d.geometry.gicp import LEAST_MATCHED, LocalCloud, align, too_few
+from geomoe3d.geometry.gicp import LEAST_MATCHED, Aligned, LocalCloud, align, too_few
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.refinement.base import PairRefiner, Refiner, refiner
 from geomoe3d.runtime.threads import usable_threads
@@ -50,6 +50,16 @@ class IcpRefiner(Refiner):
         return lambda hypothesis: aligner(hypothesis.T_target_source)
 
 
+class _Near(NamedTuple):
+    """The parts of two clouds that lie near each other, in voxels: the source's points, how many of the cloud that has
+    fewer, and both as the library takes them, None where these are too few."""
+
+    points: FloatArray
+    num_matched: int
+    source: LocalCloud | None
+    target: LocalCloud | None
+
+
 class CloudAligner:
     """Polishes transforms of one pair of clouds.
 
@@ -60,21 +70,17 @@ class CloudAligner:
     """
 
     def __init__(self, source: PreparedCloud, target: PreparedCloud, config: RefinementConfig) -> None:
-        from scipy.spatial import cKDTree
-
         self._config, self._voxel = config, source.voxel_size
         self._centre = source.points.mean(0) / source.voxel_size
         self._source, self._target = (cloud.points / source.voxel_size for cloud in (source, target))
-        self._source_tree, self._target_tree = (
-            cKDTree(points, balanced_tree=False, compact_nodes=False)
-            for points in (self._source, self._target)
-        )
+        self._trees = source.tree, target.tree
 
     def __call__(self, T_target_source: FloatArray) -> tuple[FloatArray, str | None]:
         """The motion polished so that the source's points lie in the target's surface.
 
         Twice: where the library stops hangs on where it began, by a tenth of a voxel at times, and hardly any more on
-        where a second course began.
+        where a second course began. The second takes the points and covariances of the first, unless one moved so far
+        that others may be near now.
 
         Args:
             T_target_source: (4, 4) start, local coordinates.
@@ -84,38 +90,51 @@ class CloudAligner:
             own `converged` is true even where nothing matched, so the number of matched points, finiteness
             and the distance moved are checked here.
         """
-        found, note = self._polished(T_target_source)
-        if note is not None:
-            return found, note
-        return self._polished(found)[0], None
-
-    def _polished(self, T_target_source: FloatArray) -> tuple[FloatArray, str | None]:
-        config = self._config
-        voxel = self._voxel
         start = T_target_source.copy()
-        start[:3, 3] /= voxel
-        near_target = self._near(self._target_tree, transform_points(start, self._source))
-        near_source = self._near(self._source_tree, transform_points(inverse(start), self._target))
-        num_matched = min(len(near_target), len(near_source))
-        if num_matched < LEAST_MATCHED:
-            return T_target_source, f"{too_few(num_matched)}; {_UNREFINED}"
-        found = align(
-            LocalCloud.of(self._source[near_target], _NORMAL_NEIGHBORS if config.name == "gicp" else None),
-            LocalCloud.of(self._target[near_source], _NORMAL_NEIGHBORS),
+        start[:3, 3] /= self._voxel
+        near = self._near(start)
+        found = self._aligned(near, start)
+        if found.T_target_source is None:
+            return T_target_source, f"{found.problem}; {_UNREFINED}"
+        T = found.T_target_source
+        moved = transform_points(T, near.points) - transform_points(start, near.points)
+        if np.sum(moved**2, axis=1).max() > (_MARGIN_VOXELS / 2) ** 2:
+            near = self._near(T)
+        again = self._aligned(near, T).T_target_source
+        T = T if again is None else again
+        T[:3, 3] *= self._voxel
+        return T, None
+
+    def _aligned(self, near: _Near, start: FloatArray) -> Aligned:
+        """The motion near ``start``, both in voxels, by one course of the library."""
+        config = self._config
+        if near.source is None or near.target is None:
+            return Aligned(None, too_few(near.num_matched))
+        return align(
+            near.source,
+            near.target,
             start,
             self._centre,
             reach=config.max_distance,
             method=config.name,
             max_iterations=config.max_iterations,
         )
-        if found.T_target_source is None:
-            return T_target_source, f"{found.problem}; {_UNREFINED}"
-        T = found.T_target_source
-        T[:3, 3] *= voxel
-        return T, None
 
-    def _near(self, tree: Any, points: FloatArray) -> IntArray:
-        """Which points (n, 3) have one of the tree's within the reach of the refinement and some more."""
-        reach = self._config.max_distance + _MARGIN_VOXELS
-        distance, _ = tree.query(points, distance_upper_bound=reach, workers=usable_threads())
+    def _near(self, start: FloatArray) -> _Near:
+        """What of either cloud lies within the reach of the refinement, and some more, of the other one."""
+        source = self._source[self._close(1, transform_points(start, self._source))]
+        target = self._target[self._close(0, transform_points(inverse(start), self._target))]
+        num_matched = min(len(source), len(target))
+        if num_matched < LEAST_MATCHED:
+            return _Near(source, num_matched, None, None)
+        neighbors = _NORMAL_NEIGHBORS if self._config.name == "gicp" else None
+        return _Near(
+            source, num_matched, LocalCloud.of(source, neighbors), LocalCloud.of(target, _NORMAL_NEIGHBORS)
+        )
+
+    def _close(self, which: int, points: FloatArray) -> IntArray:
+        """Which points (n, 3), in voxels, have one of a cloud's within the reach of the refinement and some more."""
+        reach = (self._config.max_distance + _MARGIN_VOXELS) * self._voxel
+        places = points * self._voxel
+        distance, _ = self._trees[which].query(places, distance_upper_bound=reach, workers=usable_threads())
         return np.flatnonzero(np.isfinite(distance))

@@ -125,8 +125,6 @@ class Verifier:
         num_queries: int = 1500,
         seed: int = 0,
     ) -> None:
-        from scipy.spatial import cKDTree
-
         if source.features is None or target.features is None:
             raise InputError(
                 "clouds without features cannot be compared; call with_features(cloud, descriptor) on both first"
@@ -141,7 +139,7 @@ class Verifier:
         self._features = source.features[chosen].astype(np.float64)
         self._target = target
         self._target_features = target.features
-        self._tree = cKDTree(target.points)
+        self._tree = target.tree
         random_features = target.features[random_targets].astype(np.float64)
         similarity = (self._features @ random_features.T).astype(np.float32)
         # Sorted, and each row lifted above the one before, so that one search counts what is more similar.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomoe3d.geometry.columns import bounds, extents, finite_rows, largest_of_rows
+from geomoe3d.geometry.columns import bounds, crossed, extents, finite_rows, largest_of_rows
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -17,6 +17,7 @@ def test_same_as_along_the_axes(count: int, order: str) -> None:
     assert np.array_equal(high, points.max(0))
     assert np.array_equal(extents(points), np.ptp(points, axis=0))
     assert np.array_equal(largest_of_rows(points), points.max(1))
+    np.testing.assert_allclose(crossed(points, points[::-1]), np.cross(points, points[::-1]), rtol=1e-12)
 
 
 def test_rows_with_anything_that_is_no_number_are_not_finite() -> None:

@@ -8,8 +8,9 @@ from surface_pairs import corner
 
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig
-from geomoe3d.features.base import with_features, with_normals_flipped
+from geomoe3d.features.base import mirrored, with_features, with_normals_flipped
 from geomoe3d.features.fpfh import FpfhDescriptor
+from geomoe3d.features.multiscale import MultiscaleDescriptor
 from geomoe3d.types import PointCloud
 
 FPFH = FpfhDescriptor()
@@ -57,3 +58,17 @@ def test_normals_turned_over_are_another_cloud_and_turned_back_the_same() -> Non
     assert (changed > 0.1).mean() > 0.1  # plain walls look alike from both sides, edges do not
     back = with_normals_flipped(over, FPFH)
     np.testing.assert_array_equal(back.features, made.features)
+
+
+def test_a_mirrored_cloud_has_the_features_that_it_would_get_anew() -> None:
+    cloud = PointCloud(corner(np.random.default_rng(14), noise=0.01) + 1.0, origin=np.array([5.0, 6, 7]))
+    made = with_features(prepare(cloud, 0.1, CONFIG, viewpoint=np.zeros(3)), FPFH)
+    turned = mirrored(made, FPFH)
+    np.testing.assert_array_equal(turned.points + turned.origin, (made.points + made.origin) * [-1, 1, 1])
+    again = with_features(turned, FPFH).features
+    # Angles that lie between two bins may fall into either.
+    assert (np.abs(turned.features - again).max(1) < 1e-4).mean() > 0.98
+    assert (np.abs(turned.features - made.features).max(1) > 0.01).mean() > 0.5
+    np.testing.assert_array_equal(mirrored(turned, FPFH).features, made.features)
+    wider = MultiscaleDescriptor()  # cannot tell, and describes the cloud once more
+    assert mirrored(with_features(made, wider), wider).features.shape == (len(made), wider.dimension)

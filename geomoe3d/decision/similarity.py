@@ -196,13 +196,6 @@ def scaled_cloud(cloud: PointCloud, factor: float) -> PointCloud:
     return replace(cloud, points=factor * cloud.points, origin=factor * cloud.origin, sensor=sensor)
 
 
-def mirrored_cloud(cloud: PointCloud) -> PointCloud:
-    """The cloud with x the other way round."""
-    flip = np.array([-1.0, 1.0, 1.0])
-    sensor = None if cloud.sensor is None else flip * cloud.sensor
-    return replace(cloud, points=flip * cloud.points, origin=flip * cloud.origin, normals=None, sensor=sensor)
-
-
 def as_similarity(
     found: Explanation, ratio: float, source: PointCloud, result: RegistrationResult
 ) -> Explanation:

@@ -65,4 +65,5 @@ class FpfhDescriptor(Descriptor):
         product changes its sign, so the second of the three histograms is turned round."""
         histograms = features.reshape(len(features), 3, -1).copy()
         histograms[:, 1] = histograms[:, 1, ::-1]
-        return histograms.reshape(features.shape)
+        turned: Float32Array = histograms.reshape(features.shape)
+        return turned

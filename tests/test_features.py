@@ -68,7 +68,7 @@ def test_a_mirrored_cloud_has_the_features_that_it_would_get_anew() -> None:
     again = with_features(turned, FPFH).features
     # Angles that lie between two bins may fall into either.
     assert (np.abs(turned.features - again).max(1) < 1e-4).mean() > 0.98
-    assert (np.abs(turned.features - made.features).max(1) > 0.01).mean() > 0.5
+    assert (np.abs(turned.features - made.features).max(1) > 0.01).mean() > 0.2
     np.testing.assert_array_equal(mirrored(turned, FPFH).features, made.features)
     wider = MultiscaleDescriptor()  # cannot tell, and describes the cloud once more
     assert mirrored(with_features(made, wider), wider).features.shape == (len(made), wider.dimension)

@@ -72,7 +72,9 @@ class SharedSurface:
 
     def _nearest(self, which: int, points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
         """Rows of the points that have a point of a cloud within reach, and the rows of those."""
-        distance, nearest = map(np.asarray, self._clouds[which].tree.query(points, distance_upper_bound=reach))
+        distance, nearest = map(
+            np.asarray, self._clouds[which].tree.query(points, distance_upper_bound=reach)
+        )
         found = np.flatnonzero(np.isfinite(distance))
         return found, nearest[found]
 

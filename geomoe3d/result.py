@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
 from geomoe3d.clouds.inputs import NOT_KEPT, Inputs
 from geomoe3d.errors import InputError
-from geomoe3d.types import BoolArray, FloatArray
+from geomoe3d.types import Accuracy, Alternative, BoolArray, CloudReport, FloatArray
 
 if TYPE_CHECKING:
     from geomoe3d.visual.view import RegistrationView
@@ -22,89 +22,6 @@ if TYPE_CHECKING:
 Status = Literal["ok", "low_confidence", "ambiguous", "failed"]
 
 _ARRAYS = {"T_target_source": (4, 4), "information_matrix": (6, 6), "information_center": (3,)}
-
-
-@dataclass(frozen=True)
-class CloudReport:
-    """What became of one input cloud.
-
-    Attributes:
-        name: file name or a given label.
-        num_input: points given.
-        num_non_finite: dropped for a NaN or infinite coordinate, or as missing at exactly (0, 0, 0).
-        num_duplicates: dropped because another point has exactly the same coordinates.
-        num_isolated: voxels dropped because no neighbour is close enough to fit a normal.
-        num_points: voxel points used.
-        origin: float64 shift removed from the file's coordinates before computing.
-    """
-
-    name: str
-    num_input: int
-    num_non_finite: int
-    num_duplicates: int
-    num_isolated: int
-    num_points: int
-    origin: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """The best hypothesis that is clearly another motion than the answer.
-
-    Attributes:
-        T_target_source: (4, 4) in file coordinates.
-        relative_score: its verification score over that of the answer, 1 means as good.
-        rotation_difference_deg: angle between the two rotations.
-        translation_difference: distance between the two images of the source centroid, cloud units.
-    """
-
-    T_target_source: FloatArray
-    relative_score: float
-    rotation_difference_deg: float
-    translation_difference: float
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """How closely the clouds lie on each other, and how far off the transform may be. Lengths in cloud units.
-
-    Distances are those of the grid points of either cloud that have a point of the other within the inlier
-    threshold and facing as they do, to the plane of the nearest one, unsigned. Deviations are one standard
-    deviation, of a vector's length where it has three components: of right answers, about two in three true errors
-    are smaller and 95 in 100 smaller than twice that (docs/measurements.md). Of a wrong answer they say nothing.
-
-    Attributes:
-        inlier_rmse: root mean square residual of the correspondences that agree with the transform.
-        overlap_source: share of source points with a target point within the inlier threshold.
-        overlap_target: share of target points with a source point within the inlier threshold.
-        distance_mean, distance_median, distance_std, distance_p95: mean, median, standard deviation and 95 %
-            quantile of the distances.
-        sigma_center: deviation of where the transform puts the centre of the overlap.
-        sigma_farthest: the same at the point of either cloud that is farthest from that centre.
-        sigma_rotation_deg: deviation of its rotation, degrees.
-    """
-
-    inlier_rmse: float
-    overlap_source: float
-    overlap_target: float
-    distance_mean: float
-    distance_median: float
-    distance_std: float
-    distance_p95: float
-    sigma_center: float
-    sigma_farthest: float
-    sigma_rotation_deg: float
-
-    def exchanged(self, scale: float = 1.0) -> Accuracy:
-        """Of the inverse: the overlaps change places, and lengths are in the unit of the old source.
-
-        Args:
-            scale: of the similarity.
-        """
-        ours = {f.name: getattr(self, f.name) for f in fields(self)}
-        lengths = {n: v / scale for n, v in ours.items() if n.startswith(("inlier", "distance", "sigma"))}
-        shares = {"overlap_source": self.overlap_target, "overlap_target": self.overlap_source}
-        return replace(self, **{**lengths, **shares, "sigma_rotation_deg": self.sigma_rotation_deg})
 
 
 @dataclass(frozen=True, eq=False, repr=False)  # arrays have no single truth value: compare what matters
@@ -337,46 +254,20 @@ class RegistrationResult:
         save_sheet(self._view(source, target, unit), path, force=force)
 
     def __repr__(self) -> str:
-        return f"<RegistrationResult {self._words()}>"
+        from geomoe3d.visual.accuracy_facts import paragraph
+
+        return f"<RegistrationResult {paragraph(self)}>"
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the words, and the clouds to turn where they are still at hand."""
+        from geomoe3d.visual.accuracy_facts import paragraph
         from geomoe3d.visual.notebook import notebook_html
 
         try:
             view = self._view(None, None)
         except (InputError, OSError):
             view = None
-        return notebook_html(self.status, self._words(), view)
-
-    def _words(self) -> str:
-        """The answer in one paragraph."""
-        words = f"{self.status}, confidence {self.confidence:.2f}"
-        names = f"'{self.source.name}' into '{self.target.name}'"
-        if not self.has_transform:
-            return "; ".join([f"{words}: no transform that maps {names} was found", *self.reasons])
-        from geomoe3d.geometry.se3 import inverse, transform_points
-
-        words += f": maps {names}, turned by {self._turn():.1f} degrees"
-        if self.scale != 1.0:
-            words += f", scaled by {self.scale:.6g}"
-        center = self.information_center[None]
-        if np.isfinite(center).all():
-            step = np.linalg.norm(
-                center - transform_points(inverse(self.T_target_source, self.scale), center)
-            )
-            words += f" and shifted by {step:.3g}"
-        words += (
-            f"; {self.overlap:.0%} of the source lies on the target, {self.num_inliers:,} of "
-            f"{self.num_correspondences:,} correspondences agree within {self.inlier_threshold:.3g}"
-        )
-        return "; ".join([words, *self.reasons])
-
-    def _turn(self) -> float:
-        """Angle of the rotation in degrees."""
-        from geomoe3d.geometry.se3 import rotation_angle_deg
-
-        return rotation_angle_deg(self.T_target_source[:3, :3] / self.scale)
+        return notebook_html(self.status, paragraph(self), view)
 
     def _transform(self) -> FloatArray:
         if not self.has_transform:

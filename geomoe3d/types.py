@@ -1,4 +1,4 @@
-"""The few nouns that travel through the package: clouds, correspondences, their weights, motions.
+"""The few nouns that travel through the package: clouds, correspondences, weights, motions, parts of a result.
 
 All of them are frozen; arrays inside are float64 unless said otherwise and are to be treated as read-only.
 Frames: a *file* coordinate is what the user's data holds; a *local* coordinate is the file coordinate minus
@@ -7,7 +7,7 @@ the cloud's float64 ``origin``. Everything between loading and the result works 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -266,3 +266,86 @@ class FilterOutput:
     logits: FloatArray | None = None
     groups: IntArray | None = None
     group_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CloudReport:
+    """What became of one input cloud.
+
+    Attributes:
+        name: file name or a given label.
+        num_input: points given.
+        num_non_finite: dropped for a NaN or infinite coordinate, or as missing at exactly (0, 0, 0).
+        num_duplicates: dropped because another point has exactly the same coordinates.
+        num_isolated: voxels dropped because no neighbour is close enough to fit a normal.
+        num_points: voxel points used.
+        origin: float64 shift removed from the file's coordinates before computing.
+    """
+
+    name: str
+    num_input: int
+    num_non_finite: int
+    num_duplicates: int
+    num_isolated: int
+    num_points: int
+    origin: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The best hypothesis that is clearly another motion than the answer.
+
+    Attributes:
+        T_target_source: (4, 4) in file coordinates.
+        relative_score: its verification score over that of the answer, 1 means as good.
+        rotation_difference_deg: angle between the two rotations.
+        translation_difference: distance between the two images of the source centroid, cloud units.
+    """
+
+    T_target_source: FloatArray
+    relative_score: float
+    rotation_difference_deg: float
+    translation_difference: float
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How closely the clouds lie on each other, and how far off the transform may be. Lengths in cloud units.
+
+    Distances are those of the grid points of either cloud that have a point of the other within the inlier
+    threshold and facing as they do, to the plane of the nearest one, unsigned. Deviations are one standard
+    deviation, of a vector's length where it has three components: of right answers, about two in three true errors
+    are smaller and 95 in 100 smaller than twice that (docs/measurements.md). Of a wrong answer they say nothing.
+
+    Attributes:
+        inlier_rmse: root mean square residual of the correspondences that agree with the transform.
+        overlap_source: share of source points with a target point within the inlier threshold.
+        overlap_target: share of target points with a source point within the inlier threshold.
+        distance_mean, distance_median, distance_std, distance_p95: mean, median, standard deviation and 95 %
+            quantile of the distances.
+        sigma_center: deviation of where the transform puts the centre of the overlap.
+        sigma_farthest: the same at the point of either cloud that is farthest from that centre.
+        sigma_rotation_deg: deviation of its rotation, degrees.
+    """
+
+    inlier_rmse: float
+    overlap_source: float
+    overlap_target: float
+    distance_mean: float
+    distance_median: float
+    distance_std: float
+    distance_p95: float
+    sigma_center: float
+    sigma_farthest: float
+    sigma_rotation_deg: float
+
+    def exchanged(self, scale: float = 1.0) -> Accuracy:
+        """Of the inverse: the overlaps change places, and lengths are in the unit of the old source.
+
+        Args:
+            scale: of the similarity.
+        """
+        ours = {f.name: getattr(self, f.name) for f in fields(self)}
+        lengths = {n: v / scale for n, v in ours.items() if n.startswith(("inlier", "distance", "sigma"))}
+        shares = {"overlap_source": self.overlap_target, "overlap_target": self.overlap_source}
+        return replace(self, **{**lengths, **shares, "sigma_rotation_deg": self.sigma_rotation_deg})

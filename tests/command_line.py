@@ -16,8 +16,8 @@ from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.filters.base import FilterOutput
 from geomoe3d.geometry.se3 import make_transform, transform_points
-from geomoe3d.result import CloudReport, RegistrationResult
-from geomoe3d.types import Correspondences, PointCloud
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import CloudReport, Correspondences, PointCloud
 
 ROOT = Path(__file__).parents[1]
 TRUTH = make_transform(

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
-from geomoe3d.result import Alternative, CloudReport, RegistrationResult
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import Alternative, CloudReport
 from geomoe3d.visual.view import RegistrationView
 
 UTM = np.array([583394.0, 5283100.0, 498.0])

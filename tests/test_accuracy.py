@@ -18,8 +18,8 @@ from geomoe3d.clouds.saving import save_aligned
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.geometry.se3 import make_transform, transform_points
-from geomoe3d.result import Accuracy, RegistrationResult
-from geomoe3d.types import Correspondences, FloatArray
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import Accuracy, Correspondences, FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts
 
 FOUND = Accuracy(0.03, 0.6, 0.4, 0.01, 0.008, 0.007, 0.025, 0.004, 0.012, 0.11)

@@ -15,7 +15,8 @@ from command_line import TRUTH, call, make_result
 from geomoe3d.cli.summary import matrix_text, summary
 from geomoe3d.errors import OutputError
 from geomoe3d.geometry.se3 import inverse, transform_points
-from geomoe3d.result import Alternative, RegistrationResult
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import Alternative
 
 # ---- the answer ----------------------------------------------------------------------------------
 

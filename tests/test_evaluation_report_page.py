@@ -16,14 +16,8 @@ from geomoe3d.evaluation.compare import compare
 from geomoe3d.evaluation.records import EvaluationPair, Measure, Prediction, RunScore
 from geomoe3d.evaluation.report_figures import is_unrelated
 from geomoe3d.evaluation.report_page import render_report, run_key, save_report, worst_failures
-from geomoe3d.evaluation.report_text import (
-    COLUMNS,
-    interval_text,
-    main_row,
-    terminal_table,
-    to_markdown,
-    value_text,
-)
+from geomoe3d.evaluation.report_text import terminal_table, to_markdown
+from geomoe3d.evaluation.report_words import COLUMNS, interval_text, main_row, value_text
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 
 import pytest
 
-from geomoe3d.errors import OutputError
-from geomoe3d.runtime.files import check_output, write_atomically, write_text
+from geomoe3d.errors import CheckpointError, InputError, OutputError
+from geomoe3d.runtime.files import check_output, file_hash, write_atomically, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -151,3 +152,13 @@ def test_folder_without_right_is_refused(tmp_path):
             check_output(tmp_path / "a.txt", force=False)
     finally:
         tmp_path.chmod(0o700)
+
+
+def test_a_hash_is_that_of_all_bytes_and_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+    content = bytes(range(256)) * (1 << 17)  # more than one piece
+    (tmp_path / "a").write_bytes(content)
+    assert file_hash(tmp_path / "a") == hashlib.sha256(content).hexdigest()
+    with pytest.raises(InputError, match="cannot read"):
+        file_hash(tmp_path / "none")
+    with pytest.raises(CheckpointError, match="cannot read"):
+        file_hash(tmp_path, CheckpointError)

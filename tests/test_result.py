@@ -16,8 +16,8 @@ from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.answer import failed_result
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
-from geomoe3d.result import Alternative, CloudReport, RegistrationResult
-from geomoe3d.types import PointCloud
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import Alternative, CloudReport, PointCloud
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -26,8 +26,8 @@ from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.similarity import find_similarity, likely_ratios, scaled_cloud
 from geomoe3d.errors import ConfigError, FormatError, InputError
 from geomoe3d.geometry.se3 import inverse, make_transform, scale_of, transform_points
-from geomoe3d.result import Accuracy, RegistrationResult
-from geomoe3d.types import FloatArray, PointCloud
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import Accuracy, FloatArray, PointCloud
 from geomoe3d.visual.page import render_page
 
 FEET = 0.3048

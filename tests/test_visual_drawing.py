@@ -9,7 +9,7 @@ import pytest
 from registration_views import UTM, room_view
 
 from geomoe3d.geometry.se3 import make_transform, transform_points
-from geomoe3d.result import Alternative
+from geomoe3d.types import Alternative
 from geomoe3d.visual.drawing import build_drawing, distance_to_target, nice_length, thin
 
 

@@ -15,7 +15,7 @@ from registration_views import NASTY, UTM, make_result, nasty_view, room_view, w
 from scipy.spatial.transform import Rotation, Slerp
 
 from geomoe3d.geometry.se3 import make_transform, rotation_angle_deg, transform_points
-from geomoe3d.result import Alternative
+from geomoe3d.types import Alternative
 from geomoe3d.visual.drawing import build_drawing, distance_to_target
 from geomoe3d.visual.page import distance_limit, render_page, save_page
 from geomoe3d.visual.view import RegistrationView

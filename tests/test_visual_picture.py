@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.errors import FormatError, OutputError
 from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.result import Alternative, CloudReport
+from geomoe3d.types import Alternative, CloudReport
 from geomoe3d.visual.drawing import build_drawing
 from geomoe3d.visual.page import save_page
 from geomoe3d.visual.picture import draw_picture, save_picture

@@ -10,7 +10,7 @@ import pytest
 from registration_views import make_result, nasty_view, room_view, without_transform
 
 from geomoe3d.errors import FormatError, OutputError
-from geomoe3d.result import Accuracy
+from geomoe3d.types import Accuracy
 from geomoe3d.visual.sheet import draw_sheet, save_sheet
 
 

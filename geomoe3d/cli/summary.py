@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from geomoe3d.clouds.transform_files import has_transform
-from geomoe3d.result import CloudReport, RegistrationResult
-from geomoe3d.types import FloatArray
+from geomoe3d.result import RegistrationResult
+from geomoe3d.types import CloudReport, FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}

@@ -21,8 +21,7 @@ from geomoe3d.decision.shared_surface import (
 )
 from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.se3 import cross_matrix, residuals, transform_points
-from geomoe3d.result import Accuracy
-from geomoe3d.types import Correspondences, FloatArray, PreparedCloud
+from geomoe3d.types import Accuracy, Correspondences, FloatArray, PreparedCloud
 
 
 def measure_accuracy(

@@ -13,10 +13,19 @@ from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.confidence import Information, Judgement
 from geomoe3d.decision.scale import Scale
 from geomoe3d.geometry.se3 import inverse, motions_apart, residuals, shift_frames, transform_points
-from geomoe3d.result import Accuracy, Alternative, CloudReport, RegistrationResult, Status
+from geomoe3d.result import RegistrationResult, Status
 from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
-from geomoe3d.types import Correspondences, FloatArray, Hypothesis, PointCloud, PreparedCloud
+from geomoe3d.types import (
+    Accuracy,
+    Alternative,
+    CloudReport,
+    Correspondences,
+    FloatArray,
+    Hypothesis,
+    PointCloud,
+    PreparedCloud,
+)
 
 _DECIDING_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "open3d", "small_gicp", "trimesh", "torch")
 

@@ -30,7 +30,7 @@
     const motion = Object.keys(card.motions)[0];
     const one = { ...card, id, element, stage, canvas: stage.querySelector("canvas"), motion, visible: false, stale: true };
     one.camera = new Camera(stage, {
-      axes: card.axes, radius: card.fits[motion].radius, sides: { slanted: [-0.6, 0.5], ...SIDES }, limits: [0.05, 20],
+      axes: card.axes, radius: card.fits[motion].radius, sides: { oblique: [-0.6, 0.5], ...SIDES }, limits: [0.05, 20],
       margin: 1.02, changed: () => invalidate(one),
     });
     cards.push(one);

@@ -22,12 +22,12 @@ from markupsafe import Markup
 from geomoe3d import __version__
 from geomoe3d.data.collection import load_fragment
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.evaluation import report_text
+from geomoe3d.evaluation import report_words
 from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.metrics import has_motion
 from geomoe3d.evaluation.records import EvaluationPair, PairScore, Prediction, RunScore
 from geomoe3d.evaluation.report_figures import NUM_COLORS, NUM_STAGE_COLORS, figures, is_unrelated, time_bars
-from geomoe3d.evaluation.report_text import benchmark_rank, recall_of, run_key, warnings
+from geomoe3d.evaluation.report_words import benchmark_rank, recall_of, run_key, warnings
 from geomoe3d.evaluation.summary import title
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.runtime.files import check_output, write_text
@@ -113,8 +113,8 @@ def render_report(
         "comparisons": comparisons,
         "galleries": galleries,
         "name_of": title,
-        "text": report_text,
-        "dumped": lambda identity: json.dumps(report_text.finite(identity), indent=1, sort_keys=True),
+        "text": report_words,
+        "dumped": lambda identity: json.dumps(report_words.finite(identity), indent=1, sort_keys=True),
     }
     data = {str(card.number): card.clouds for card in cards if card.clouds is not None}
     return render_cloud_page("evaluation", "report", values, data)

@@ -15,7 +15,8 @@ from geomoe3d.evaluation.compare import Comparison, compare
 from geomoe3d.evaluation.evaluation_set import load_run_pairs
 from geomoe3d.evaluation.predictions import find_runs, read_info, read_predictions
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
-from geomoe3d.evaluation.report_text import run_key, to_json, to_markdown
+from geomoe3d.evaluation.report_text import to_json, to_markdown
+from geomoe3d.evaluation.report_words import run_key
 from geomoe3d.evaluation.summary import summarise
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.progress import Watch, shows_progress

@@ -13,7 +13,7 @@ from geomoe3d.clouds.formats.las import read_pieces
 from geomoe3d.clouds.io import load_points
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.columns import finite_rows
-from geomoe3d.networks.weight_files import file_hash
+from geomoe3d.runtime.files import file_hash
 from geomoe3d.types import FloatArray
 
 _STREAMED = (".las", ".laz")

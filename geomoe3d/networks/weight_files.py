@@ -7,7 +7,6 @@ hash, architecture or tensors do not fit is refused.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, ConfigError, MissingWeightsError
 from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.runtime.files import file_hash
 
 PACKAGED = Path(__file__).parent / "weights"
 DEFAULT_WEIGHTS = "geomoe3d"
@@ -95,7 +95,7 @@ def check_weights(name_or_path: str | Path) -> Path:
     """
     path = find_weights(name_or_path)
     expected = read_card(path).sha256
-    if (digest := file_hash(path)) != expected:
+    if (digest := file_hash(path, CheckpointError)) != expected:
         raise CheckpointError(
             f"'{path}' does not match its card: sha256 {digest[:16]}..., card says {expected[:16]}...; "
             f"the file is damaged or belongs to another card; fetch or export both again"
@@ -123,18 +123,6 @@ def read_weights(name_or_path: str | Path) -> tuple[NetworkConfig, dict[str, NDA
         return config, load(path.read_bytes()), card
     except (ConfigError, SafetensorError) as error:
         raise CheckpointError(f"'{path}': {error}") from None
-
-
-def file_hash(path: Path) -> str:
-    """sha256 of a file, hexadecimal.
-
-    Raises:
-        CheckpointError: it cannot be read.
-    """
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise CheckpointError(f"cannot read '{path}': {error.strerror or error}") from None
 
 
 def read_card(path: str | Path) -> WeightCard:

@@ -8,12 +8,13 @@ same folder, so that a reader, a full disk or an interrupt never meets half a fi
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import secrets
 from collections.abc import Callable
 from pathlib import Path
 
-from geomoe3d.errors import ExistingFileError, OutputError
+from geomoe3d.errors import ExistingFileError, GeoMoE3DError, InputError, OutputError
 
 
 def check_output(path: str | os.PathLike[str], *, force: bool) -> Path:
@@ -98,6 +99,22 @@ def write_text(path: str | os.PathLike[str], text: str, *, force: bool) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
     write_atomically(path, write, force=force)
+
+
+def file_hash(path: Path, unreadable: type[GeoMoE3DError] = InputError) -> str:
+    """sha256 of a file, hexadecimal, read in pieces.
+
+    Raises:
+        unreadable: it cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as stream:
+            while piece := stream.read(1 << 24):
+                digest.update(piece)
+    except OSError as error:
+        raise unreadable(f"cannot read '{path}': {error.strerror or error}") from None
+    return digest.hexdigest()
 
 
 def _move(temporary: Path, path: Path, *, force: bool) -> None:

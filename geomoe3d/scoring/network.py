@@ -17,7 +17,8 @@ import numpy as np
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import PartConfig
 from geomoe3d.errors import CheckpointError
-from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, check_weights, file_hash, judges_transforms
+from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, check_weights, judges_transforms
+from geomoe3d.runtime.files import file_hash
 from geomoe3d.runtime.sources import source_hash
 from geomoe3d.scoring.base import PairScorer, Scorer, scorer
 from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, Score
@@ -109,7 +110,11 @@ class NetworkScorer(Scorer):
 
     def identity(self) -> dict[str, Any]:
         """Hash of the weights and of the code that runs them."""
-        return {"part": NETWORK, "weights": file_hash(self._path), "code": source_hash(_RUN_BY)}
+        return {
+            "part": NETWORK,
+            "weights": file_hash(self._path, CheckpointError),
+            "code": source_hash(_RUN_BY),
+        }
 
     def about(self, pair: Pair) -> PairScorer:
         """See `Scorer`."""

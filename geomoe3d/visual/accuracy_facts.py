@@ -1,4 +1,4 @@
-"""How accurate an answer is, in words: the same on the console, in pictures and on pages."""
+"""An answer and how accurate it is, in words: the same on the console, in pictures, on pages and in notebooks."""
 
 from __future__ import annotations
 
@@ -49,3 +49,31 @@ def _scale(result: RegistrationResult) -> str:
     sigma = result.evidence.get("scale_sigma")
     unsure = "" if sigma is None else f" +- {100 * sigma:.1f} %"
     return f"{result.scale:.6g}{unsure}: lengths of the target over those of the source"
+
+
+def paragraph(result: RegistrationResult) -> str:
+    """The answer in one paragraph, which begins with its status."""
+    words = f"{result.status}, confidence {result.confidence:.2f}"
+    names = f"'{result.source.name}' into '{result.target.name}'"
+    if not result.has_transform:
+        return "; ".join([f"{words}: no transform that maps {names} was found", *result.reasons])
+    from geomoe3d.geometry.se3 import inverse, rotation_angle_deg, transform_points
+
+    T = result.T_target_source
+    words += f": maps {names}, turned by {rotation_angle_deg(T[:3, :3] / result.scale):.1f} degrees"
+    if result.scale != 1.0:
+        words += f", scaled by {result.scale:.6g}"
+    center = result.information_center[None]
+    if np.isfinite(center).all():
+        step = np.linalg.norm(center - transform_points(inverse(T, result.scale), center))
+        words += f" and shifted by {step:.3g}"
+    words += (
+        f"; {result.overlap:.0%} of the source lies on the target, {result.num_inliers:,} of "
+        f"{result.num_correspondences:,} correspondences agree within {result.inlier_threshold:.3g}"
+    )
+    if result.ok and (found := result.accuracy) is not None:
+        words += (
+            f"; uncertainty, one standard deviation: {found.sigma_center:.2g} at the centre of the overlap and "
+            f"{found.sigma_rotation_deg:.2g} degrees"
+        )
+    return "; ".join([words, *result.reasons])

@@ -17,7 +17,8 @@ from geomoe3d.geometry.se3 import residuals
 from geomoe3d.types import BoolArray, FloatArray, IntArray, PointCloud
 
 if TYPE_CHECKING:
-    from geomoe3d.result import Alternative, RegistrationResult
+    from geomoe3d.result import RegistrationResult
+    from geomoe3d.types import Alternative
 
 WEIGHT_THRESHOLD = 0.5
 _MATTERS = 1 / 3  # of the answer's score

@@ -1,22 +1,27 @@
-"""Scans in maps: one room, three rooms side by side, scans of another building, a generated building; peers beside.
+"""Scans in maps: one room, three rooms side by side, scans of another building, generated buildings; peers beside.
 
-    python scripts/measure_maps.py OUT [--cases room three stranger building alike] [--methods geomoe3d kiss-matcher
-        open3d-feature-ransac] [--every 1]
+    python scripts/measure_maps.py OUT [--cases room three stranger building alike large] [--methods geomoe3d
+        kiss-matcher open3d-feature-ransac] [--every 1]
 
 The rooms are three dev scenes of 3DMatch, each merged by its published poses; 60 fragments are asked for, 20 of each.
 They are left out in five turns: a map holds none of the twelve fragments asked for in its turn. Side by side the rooms
 stand 12 m apart (34 m, 3 million points). Strangers are the fragments of a fourth scene, sought in the three rooms.
 The building holds 40 generated rooms in a raster, no two alike, or (`alike`) ten of them the same room; each is
 scanned from three places by a laser on a tripod. Every second room, or each of those that are alike, is asked for by a
-depth camera that turns by 60 degrees. Peers register the same clouds on the grid of geomoe3d. Right: within 15 degrees
-and 30 cm. One line per query goes to OUT/queries.jsonl; what is there is not done again; `--every N` asks for every Nth
-query. The map's time is that of `Map.from_cloud`, once per turn; a query's is that of `Map.locate`.
+depth camera that turns by 60 degrees. `large` is the building without two alike, scanned more finely: some 50 million
+points as OUT/large.laz, indexed by a process of its own, whose memory is measured. Peers register the same clouds on
+the grid of geomoe3d. Right: within 15 degrees and 30 cm. One line per query goes to OUT/queries.jsonl; what is there
+is not done again; `--every N` asks for every Nth query. The map's time is that of `Map.from_cloud`, once per turn; a
+query's is that of `Map.locate`.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import statistics
+import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -27,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.clouds.io import load_points
-from geomoe3d.data.rooms.scanner import TRIPOD, LaserScanner, stand_scanner
+from geomoe3d.data.rooms.scanner import TRIPOD, LaserScanner, ScannerSettings, stand_scanner
 from geomoe3d.data.rooms.scenes import Scene, generate_scene
 from geomoe3d.data.rooms.sensor import KINECT, cast
 from geomoe3d.data.rooms.walk import camera_pose
@@ -43,9 +48,10 @@ from geomoe3d.types import FloatArray
 
 OURS = "geomoe3d"
 METHODS = (OURS, "kiss-matcher", "open3d-feature-ransac")
-CASES = ("room", "three", "stranger", "building", "alike")
+CASES = ("room", "three", "stranger", "building", "alike", "large")
 ROOMS, ALIKE, SPACE = 40, 10, 9.0
 _TRIPOD = TRIPOD.model_copy(update={"rings": 150, "azimuth_step_deg": 1.0})
+_FINE_TRIPOD = TRIPOD.model_copy(update={"rings": 500, "azimuth_step_deg": 0.36})
 APART, PER_SCENE, TURNS = 12.0, 20, 5
 GRID = 0.055  # of the peers; geomoe3d describes these maps on it
 
@@ -137,15 +143,32 @@ class Building:
     def _place(self, room: int) -> FloatArray:
         return np.array([SPACE * (room % 8), SPACE * (room // 8), 0.0])
 
-    def cloud(self) -> FloatArray:
-        """(N, 3) of all rooms, each scanned anew."""
-        parts = []
+    def scans(self, settings: ScannerSettings = _TRIPOD) -> Iterator[FloatArray]:
+        """(N, 3) of each scan of each room."""
         for room, seed in enumerate(self._seeds):
             rng, scene = np.random.default_rng((1, room)), self._scenes[seed]
             for pose in stand_scanner(np.random.default_rng((2, seed)), scene, 3):
-                points = LaserScanner(_TRIPOD).scan(scene.rays, pose, rng)
-                parts.append(transform_points(pose, points) + self._place(room))
-        return np.concatenate(parts)
+                yield transform_points(
+                    pose, LaserScanner(settings).scan(scene.rays, pose, rng)
+                ) + self._place(room)
+
+    def cloud(self) -> FloatArray:
+        """(N, 3) of all rooms, each scanned anew."""
+        return np.concatenate(list(self.scans()))
+
+    def write(self, path: Path) -> int:
+        """All rooms, scanned more finely, as a LAZ file; how many points that are."""
+        import laspy
+
+        header = laspy.LasHeader(point_format=0, version="1.2")
+        header.scales, count = np.full(3, 0.001), 0
+        with laspy.open(path, mode="w", header=header) as file:
+            for points in self.scans(_FINE_TRIPOD):
+                record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+                record.x, record.y, record.z = points.T
+                file.write_points(record)
+                count += len(points)
+        return count
 
     def view(self, room: int) -> tuple[FloatArray, FloatArray]:
         """(N, 3) of a depth camera in one room, in its frame, and its pose T_map_camera."""
@@ -191,9 +214,31 @@ def maps(scenes: Scenes, cases: list[str]) -> Iterator[tuple[str, int, list[str]
             other = scenes.names[3]
             queries = [Query("stranger", other, n, turn, None) for n in scenes.numbers(other)[turn::TURNS]]
             yield "stranger", turn, rooms, queries
-    for case in ("building", "alike"):
+    for case in ("building", "alike", "large"):
         if case in cases:
             yield case, 0, [], [Query(case, "rooms", n, 0, None) for n in Building(case == "alike").asked]
+
+
+def indexed_apart(building: Building, out: Path) -> tuple[Map, float]:
+    """The large building indexed by a process of its own, and its seconds; prints what it took."""
+    cloud, path = out / "large.laz", out / "large.map"
+    if not cloud.exists():
+        part = out / "part.laz"
+        building.write(part)
+        part.rename(cloud)
+    begin = time.perf_counter()
+    subprocess.run(
+        [sys.executable, "-m", "geomoe3d", "index", str(cloud), str(path), "--fresh", "--quiet"], check=True
+    )
+    seconds = time.perf_counter() - begin
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    made = Map.open(path)
+    print(
+        f"indexed {made.num_points:,} points in {seconds:.0f} s ({used.ru_utime + used.ru_stime:.0f} s of processor "
+        f"time), {used.ru_maxrss / 2**20:.2f} GiB at most, described on a grid of {made.voxel_sizes[0]:.3g}",
+        flush=True,
+    )
+    return made, seconds
 
 
 def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Map | None) -> dict[str, Any]:
@@ -257,10 +302,14 @@ def main() -> None:
             open_ones = [(q, m) for q in chosen for m in options.methods if (q.key, m) not in done]
             if not open_ones:
                 continue
-            building = Building(case == "alike") if case in ("building", "alike") else None
-            world = scenes.merged(rooms, turn) if building is None else building.cloud()
-            made, indexed = None, 0.0
-            if any(method == OURS for _, method in open_ones):
+            building = None if rooms else Building(case == "alike")
+            made, indexed, world = None, 0.0, np.zeros((0, 3))
+            if case == "large" and building is not None:
+                open_ones = [(q, method) for q, method in open_ones if method == OURS]
+                made, indexed = indexed_apart(building, options.out)
+            else:
+                world = scenes.merged(rooms, turn) if building is None else building.cloud()
+            if made is None and any(method == OURS for _, method in open_ones):
                 begin = time.perf_counter()
                 made = Map.from_cloud(world)
                 indexed = time.perf_counter() - begin

@@ -14,7 +14,10 @@ from geomoe3d.cli.errors import BAD_INPUT, OK, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
 from geomoe3d.features.base import with_features
+from geomoe3d.features.learned import LearnedDescriptor
 from geomoe3d.features.multiscale import MultiscaleDescriptor
+from geomoe3d.features.pyramid import pyramid
+from geomoe3d.maps import store
 from geomoe3d.maps.facing import both_sides, facing_alike
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.voxels import VoxelSums
@@ -154,6 +157,18 @@ def test_a_changed_file_is_damaged(tmp_path):
         Map.open(path)
 
 
+def test_a_map_of_another_descriptor_is_described_anew(house, scan, tmp_path, monkeypatch):
+    path = tmp_path / "house.map"
+    house.save(path)
+    monkeypatch.setattr(store, "_descriptor", lambda: "another")
+    again = Map.open(path, voxel_size=GRID)
+    assert again.voxel_sizes == ()
+    assert again.num_points == house.num_points
+    found = again.locate(scan[0])
+    assert found.ok
+    assert again.voxel_sizes == house.voxel_sizes
+
+
 def test_units_and_sizes_that_cannot_be_fail_with_the_reason(house, scan):
     larger = house.locate(1000.0 * scan[0])
     assert larger.status == "failed"
@@ -181,6 +196,37 @@ def test_voxels_are_those_of_the_whole_in_whatever_pieces():
     coarse = VoxelSums.empty(1.0, np.zeros(3)).added(points)
     np.testing.assert_array_equal(whole.coarser().keys, coarse.keys)
     np.testing.assert_allclose(whole.coarser().points, coarse.points, atol=1e-12)
+
+
+def test_the_edge_for_a_count_is_the_one_that_gives_it():
+    rng = np.random.default_rng(7)
+    points = rng.uniform(0, 8, (40_000, 3)) * (1, 1, 0)  # a plane fills voxels like 1 / size^2
+    voxels = VoxelSums.empty(0.05, np.zeros(3)).added(points)
+    for count in (200, 900, 4000):
+        edge = voxels.edge_for(count)
+        assert len(VoxelSums.empty(edge, np.zeros(3)).added(points)) == pytest.approx(count, rel=0.15)
+    assert voxels.edge_for(10**6) == voxels.edge
+
+
+def test_a_part_of_a_map_is_what_lies_near_some_places():
+    points = np.random.default_rng(8).uniform(-3, 3, (3000, 3))
+    whole = VoxelSums.empty(0.5, np.zeros(3)).added(points)
+    places = np.array([[-2.0, 0, 0], [2.0, 1, 0]])
+    part = whole.within(places, 1.0)
+    away = np.linalg.norm(whole.points[:, None] - places, axis=2).min(axis=1)
+    np.testing.assert_array_equal(part.keys, whole.keys[away <= 1.0])
+    np.testing.assert_array_equal(part.points, whole.points[away <= 1.0])
+
+
+def test_some_points_are_described_as_all_are():
+    rng = np.random.default_rng(9)
+    points = rng.uniform(0, 1, (900, 3)) * (3, 3, 0.3)
+    normals = rng.normal(size=(900, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = PreparedCloud(points, normals, None, 0.1, None, np.zeros(3))
+    rows = np.arange(5, 900, 7)
+    some = LearnedDescriptor().at(pyramid(cloud), rows)
+    np.testing.assert_allclose(some, LearnedDescriptor()(cloud)[rows], atol=1e-5)
 
 
 def test_signs_run_along_a_sphere():
@@ -236,6 +282,45 @@ def test_index_and_locate_in_the_shell(rooms, scan, tmp_path, monkeypatch, capfd
     assert "three numbers" in capfd.readouterr().err
     assert ask("locate", "scan.npy", "nowhere.map") == BAD_INPUT
     assert "there is no map 'nowhere.map'" in capfd.readouterr().err
+
+
+def test_what_is_no_map_is_never_overwritten(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    cloud = np.random.default_rng(0).uniform(0, 1, (500, 3))
+    for name in ("one.npy", "two.npy"):
+        np.save(name, cloud)
+    assert ask("index", "one.npy", "two.npy", "--fresh") == BAD_INPUT
+    assert "ends in .map, found 'two.npy'" in capfd.readouterr().err
+    np.testing.assert_array_equal(np.load("two.npy"), cloud)
+    assert ask("locate", "house.map", "one.npy") == BAD_INPUT
+    assert "'house.map' is a map" in capfd.readouterr().err
+
+
+def test_an_empty_folder_is_named(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    for words in (("index", "empty", "out.map"), ("locate", "empty", "out.map")):
+        assert ask(*words) == BAD_INPUT
+        assert "'empty' holds no clouds" in capfd.readouterr().err
+    assert not (tmp_path / "out.map").exists()
+
+
+def test_a_sequence_goes_on_after_a_scan_that_cannot_be_read(house, scan, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    house.save("house.map")
+    (tmp_path / "scans").mkdir()
+    np.save("scans/a.npy", scan[0])
+    np.save("scans/b.npy", np.full((10, 3), np.nan))
+    assert ask("locate", "scans", "house.map", "--voxel-size", GRID, "--output", "poses.tum") == BAD_INPUT
+    told = capfd.readouterr()
+    assert "1 of 2 ok" in told.out
+    assert "scans per second" in told.out
+    assert "b" in told.err
+    lines = (tmp_path / "poses.tum").read_text().splitlines()
+    pose = [line.split() for line in lines if line[0] != "#"]
+    assert len(pose) == 1
+    assert pose[0][0] == "0"
+    assert "# 1 b: unusable" in lines
 
 
 def test_a_laz_is_read_in_pieces(tmp_path):

@@ -41,6 +41,8 @@ def command(
     """
     if len(inputs) < 2:
         raise click.UsageError("give at least one cloud, and OUT.map last")
+    if Path(inputs[-1]).suffix.lower() != ".map":
+        raise click.UsageError(f"the last name is that of the map and ends in .map, found '{inputs[-1]}'")
     from geomoe3d.cli.progress import stage_display, stdout_to_stderr
 
     with stdout_to_stderr(), stage_display(quiet) as stage:

@@ -60,6 +60,9 @@ def command(
     """
     if len(inputs) < 2:
         raise click.UsageError("give at least one scan, and the map last")
+    maps = [name for name in inputs[:-1] if Path(name).suffix.lower() == ".map"]
+    if maps:
+        raise click.UsageError(f"'{maps[0]}' is a map: give the scans first and one map last")
     from geomoe3d.cli.progress import stage_display, stdout_to_stderr
 
     with stdout_to_stderr(), stage_display(quiet) as stage:

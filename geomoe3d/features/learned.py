@@ -25,7 +25,7 @@ from geomoe3d.features.base import Descriptor, descriptor
 from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.features.pyramid import FACTORS, Level, nearest, pyramid, relations
 from geomoe3d.runtime.threads import each, single_blas_thread
-from geomoe3d.types import Float32Array, PreparedCloud
+from geomoe3d.types import Float32Array, IntArray, PreparedCloud
 
 NUM_NEIGHBORS = 16
 LEARNED = 32
@@ -65,12 +65,22 @@ class LearnedDescriptor(Descriptor):
         return self._of(pyramid(cloud, cloud.features if before == FpfhDescriptor() else None))
 
     def _of(self, levels: tuple[Level, ...]) -> Float32Array:
+        return self.at(levels, np.arange(len(levels[0])))
+
+    def at(self, levels: tuple[Level, ...], rows: IntArray) -> Float32Array:
+        """Features (m, 65) of some points of a cloud, the cheaper the fewer.
+
+        Args:
+            levels: of the cloud, by `pyramid`.
+            rows: (m,) of the finest level.
+        """
+        given = levels[0].features[rows]
         if not levels[0].features.any():  # isolated points have nothing to go by
-            return np.zeros((len(levels[0]), DIMENSION), dtype=np.float32)
+            return np.zeros((len(rows), DIMENSION), dtype=np.float32)
         with single_blas_thread():
-            learned = _Network(self._tensors, levels).features()
+            learned = _Network(self._tensors, levels).features(rows)
         shares = np.sqrt(np.array([1 - _FPFH_SHARE, _FPFH_SHARE], dtype=np.float32))
-        return np.hstack([shares[0] * learned, shares[1] * levels[0].features])
+        return np.hstack([shares[0] * learned, shares[1] * given])
 
 
 class _Network:
@@ -79,10 +89,11 @@ class _Network:
     def __init__(self, tensors: dict[str, Float32Array], levels: tuple[Level, ...]) -> None:
         self._tensors, self._levels = tensors, levels
 
-    def features(self) -> Float32Array:
-        """(n, 32) unit features of the finest level."""
-        fine, middle, coarse = self._levels
-        own = [self._mlp(f"embed.{k}", self._given(level)) for k, level in enumerate(self._levels)]
+    def features(self, rows: IntArray) -> Float32Array:
+        """(m, 32) unit features of some points of the finest level."""
+        whole, middle, coarse = self._levels
+        fine = whole.take(rows)
+        own = [self._mlp(f"embed.{k}", self._given(level)) for k, level in enumerate((fine, middle, coarse))]
         held = self._look("middle_middle", middle, middle, own[1], own[1])
         wide = self._look("coarse_middle", coarse, middle, own[2], held)
         wide = self._look("coarse_coarse", coarse, coarse, wide, wide)

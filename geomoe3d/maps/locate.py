@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.clouds.prepare import orient_normals
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import RegistrationConfig
 from geomoe3d.decision.accuracy import measure_accuracy
@@ -22,14 +21,13 @@ from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import judge, lead_over
 from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
-from geomoe3d.features.base import with_features
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
-from geomoe3d.maps.level import Level
+from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.places import Query
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import Float32Array, FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
 _FIRST_WINDOWS, _WINDOWS, _MORE_WINDOWS = 6, 12, 24
 _PLAIN = 0.65  # a quick score that hardly any wrong motion reaches: no more windows are looked into
@@ -51,10 +49,17 @@ class Found:
     Attributes:
         pair: the scan, and the map around the place.
         decision: of the ordinary line there.
+        sure: whether it was ok beside all rivals, before the scale was measured: more looks cannot help then.
     """
 
     pair: Pair
     decision: Decision
+    sure: bool = False
+
+    @property
+    def confidence(self) -> float:
+        """Of the decision."""
+        return self.decision.judgement.confidence
 
 
 class Search:
@@ -63,7 +68,7 @@ class Search:
     Args:
         line: parts of the configuration.
         scan: on the level's grid, with the features of the line.
-        features: (n, 99) of the scan's points, by `MultiscaleDescriptor`.
+        compared: of the scan, with the features of the level.
         level: of the map.
         part: of what is cut out of the map: its name, origin and counts; its arrays are replaced.
         clock: told of the stages.
@@ -73,12 +78,12 @@ class Search:
         self,
         line: Pipeline,
         scan: PreparedCloud,
-        features: Float32Array,
+        compared: Compared,
         level: Level,
         part: PreparedCloud,
         clock: StageClock,
     ) -> None:
-        self._line, self._level, self._part, self._clock = line, level, part, clock
+        self._line, self.level, self._part, self._clock = line, level, part, clock
         self.config: RegistrationConfig = line.config
         self.scan = scan
         self.center = scan.points.mean(0)
@@ -89,7 +94,7 @@ class Search:
         margin = _MARGIN * scan.voxel_size
         self._box = scan.points.min(0) - margin, scan.points.max(0) + margin
         clock("places")
-        self._query = Query(scan, features, level, seed=self.config.seed)
+        self._query = Query(compared, level, seed=self.config.seed)
         rng = np.random.default_rng(self.config.seed)
         self._rows = np.sort(rng.permutation(len(scan))[:_ASKED])
         self._order = rng.permutation(len(level.points))
@@ -105,7 +110,7 @@ class Search:
         """Distinct motions into the map with their quick scores, best first.
 
         Args:
-            more: look into twice as many windows, and match all points.
+            more: look into twice as many windows, with more matches.
             near: (3,) where the scan's sensor, or its middle where none is known, is said to be, local coordinates,
                 and how far off at most.
             given: further motions (4, 4), local coordinates.
@@ -120,7 +125,7 @@ class Search:
         for number, window in enumerate(windows):
             if number >= _FIRST_WINDOWS and max((q for q, _ in scored), default=0.0) > plain:
                 break
-            proposed = self._query.motions(window, _PER_WINDOW, fine=more)
+            proposed = self._query.motions(window, _PER_WINDOW, more=more)
             if near is not None:
                 proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
             scored += [(self._quick(h.T_target_source), h) for h in proposed]
@@ -144,11 +149,14 @@ class Search:
         shift, turn = motions_apart(a.T_target_source, b.T_target_source, self.center)
         return shift > self._apart or turn > _MOST_TURN_DEG
 
-    def look(self, hypothesis: Hypothesis) -> Found:
-        """The ordinary line on the scan and the map around where a motion puts it."""
+    def look(self, hypothesis: Hypothesis, *, fully: bool = False) -> Found:
+        """The ordinary line on the scan and the map around where a motion puts it.
+
+        ``fully``: with features of just what is around, in place of those that the map holds.
+        """
         with single_blas_thread():
             T = hypothesis.T_target_source
-            target = self._around(T)
+            target = self._around(T, fully)
             self._clock("match")
             pair = self._line.match((self.scan, target), None, self._clock)
             _, proposed = self._line.propose(pair, self._clock)
@@ -179,6 +187,7 @@ class Search:
         )
         information = best.decision.information
         judgement = judge(answer, rival, lead, support, information, self.config.decision, len(matched))
+        sure = judgement.status == "ok" and best.decision.judgement.status == "ok"
         if judgement.status == "ok":  # never where it was not sure before it had rivals
             judgement = best.decision.judgement
         decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
@@ -188,7 +197,7 @@ class Search:
         T, pair = decision.T_target_source, best.pair
         decision = decision.with_scale(measure_scale(T, *pair.clouds))
         told = measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold)
-        return Found(pair, replace(decision, accuracy=told)), distinct
+        return Found(pair, replace(decision, accuracy=told), sure), distinct
 
     def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
         return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]
@@ -197,7 +206,7 @@ class Search:
         """A motion drawn closer by a few steps of point-to-plane alignment on the points of the quick look."""
         from scipy.spatial.transform import Rotation
 
-        level = self._level
+        level = self.level
         points, normals = self.scan.points[self._rows], self.scan.normals[self._rows]
         for reach in _POLISHING:
             moved = transform_points(T, points)
@@ -220,7 +229,7 @@ class Search:
     def _quick(self, T: FloatArray) -> float:
         """Share of the scan's points that lie on the map with an agreeing plane, times exp(-10 v), v the share of map
         points that stand where the scan's sensor looked through."""
-        level, voxel = self._level, self._level.voxel_size
+        level, voxel = self.level, self.level.voxel_size
         moved = transform_points(T, self.scan.points[self._rows])
         distance, nearest = level.tree.query(moved, distance_upper_bound=2 * voxel)
         hit = np.isfinite(distance)
@@ -237,22 +246,19 @@ class Search:
         violation = float((margin < -4 * voxel).sum() / (seen.sum() + 0.05 * len(around)))
         return agreement * float(np.exp(-_VIOLATION_WEIGHT * violation))
 
-    def _around(self, T: FloatArray) -> PreparedCloud:
-        """What the map holds within the scan's box, turned to where the motion puts the scan's sensor."""
-        level = self._level
+    def _around(self, T: FloatArray, fully: bool) -> PreparedCloud:
+        """What the map holds within the scan's box, as seen from where the motion puts the scan's sensor."""
+        level = self.level
         center, eye = transform_points(T, np.stack([self.center, self.eye]))
-        rows = level.tree.query_ball_point(
+        near = level.tree.query_ball_point(
             center, self.reach + _MARGIN * level.voxel_size, return_sorted=True
         )
-        points = level.points[rows]
-        part = replace(
-            self._part,
-            points=points,
-            normals=orient_normals(points, level.normals[rows], eye),
-            viewpoint=None if self.scan.viewpoint is None else eye,
-        )
+        rows = np.array(near, dtype=np.int64)
+        there = transform_points(inverse(T), level.points[rows])
+        rows = rows[((there > self._box[0]) & (there < self._box[1])).all(axis=1)]
+        part = replace(self._part, viewpoint=None if self.scan.viewpoint is None else eye)
         self._clock("features")
-        return with_features(part, self._line.descriptor)
+        return level.seen_from(eye, rows, part, self._line.descriptor, fully)
 
 
 def likely(candidates: Sequence[tuple[float, Hypothesis]], most: int) -> Iterator[Hypothesis]:

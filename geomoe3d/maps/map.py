@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,7 @@ from geomoe3d.clouds.prepare import (
     choose_voxel_size,
     prepare,
     robust_extent,
+    round_size,
     typical_spacing,
 )
 from geomoe3d.clouds.recentre import choose_origin
@@ -29,7 +31,7 @@ from geomoe3d.decision.answer import failed_result, finished_result
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.se3 import check_motion, motions_apart, shift_frames, transform_points
-from geomoe3d.maps.level import Level, described_twice
+from geomoe3d.maps.level import Level, described
 from geomoe3d.maps.locate import Found, Search, likely
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.store import Source, load, save
@@ -40,10 +42,19 @@ from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 _MOST_VOXELS = 4_000_000
-_USUAL_POINTS = 200_000  # of the grid on which a map is described before any scan is known
+_USUAL_POINTS = (
+    150_000  # at least, where it holds so many: of the grid on which a map is described before any scan
+)
+_USUAL_SHARE = 20  # points of the map for each of that grid
+_MOST_POINTS = 1_000_000  # of any grid: 50 s of processor time, and 150 MB
 _PIECE = 1_000_000
-_NEAR_SIZE = 1.3  # a level whose voxels are so many times as large or small as the scan's own serves it
+_FINER, _COARSER = (
+    1.3,
+    2.0,
+)  # a level whose voxels are so many times as small or large as the scan's own serves it
 _CANDIDATES = 4
+Look = Literal["quick", "more", "finer"]
+"""At the likeliest windows; at more of them with more matches; around what was found, on the scan's own grid."""
 NOWHERE = "no place in the map was found at which the scan could lie"
 _LARGER = 3.0  # times the map's extent from which a scan is no part of it
 
@@ -244,9 +255,11 @@ class Map:
             raise EmptyCloudError("the map holds no points yet; add a cloud first: map.with_cloud(...)")
         if progress is not None:
             progress("describe")
-        # Surfaces fill voxels like 1 / size^2.
-        usual = self._voxels.edge * max(1.25, math.sqrt(len(self._voxels) / _USUAL_POINTS))
-        self._level(voxel_size or self.config.voxel_size or float(f"{usual:.2g}"))
+        wanted = voxel_size or self.config.voxel_size
+        if wanted is None:
+            usual = min(max(_USUAL_POINTS, self.num_points // _USUAL_SHARE), _MOST_POINTS)
+            wanted = round_size(max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge))
+        self._level(wanted, 1.0)
 
     @property
     def num_points(self) -> int:
@@ -332,39 +345,55 @@ class Map:
             clock: told of the stages.
         """
         clock("prepare")
-        preparation = self.config.preparation
-        wanted = self.config.voxel_size or choose_voxel_size(cloud, cloud, preparation.voxel_points)
-        level = self._level(bounded_voxel_size(cloud, cloud, wanted, preparation.max_points))
-        view = find_viewpoints(cloud, cloud, preparation.viewpoint)[0]
-        bare = prepare(cloud, level.voxel_size, preparation, viewpoint=view, seed=self.config.seed)
-        clock("features")
-        described, wide = described_twice(bare, self._pipeline.descriptor)
-        search = Search(self._pipeline, described, wide, level, self._part(level), clock)
+        rule = self.config.preparation.viewpoint
+        view = find_viewpoints(cloud, cloud, rule)[0]
         local = [shift_frames(T, -cloud.origin, -self._voxels.origin) for T in guesses]
-        found: list[Found] = []
-        looked: list[Hypothesis] = []
+        own = self.config.voxel_size or choose_voxel_size(cloud, cloud, self.config.preparation.voxel_points)
+        own = bounded_voxel_size(cloud, cloud, own, self.config.preparation.max_points)
+        level = self._level(own, _COARSER if self.config.voxel_size is None else _FINER)
+        search = self._begun(cloud, view, level, clock)
         known: list[FloatArray] = []
         best: Found | None = None
         ranked: list[Hypothesis] = []
-        for more, where in self._rounds(near):
-            candidates = search.candidates(more=more, near=where, given=[*local, *known])
-            known += [h.T_target_source for _, h in candidates]
-            fresh = [h for h in likely(candidates, count) if all(search.differ(h, old) for old in looked)]
-            looked += fresh
-            found += [search.look(h) for h in fresh]
-            if found:
-                best, ranked = search.decide(found)
-                if best.decision.judgement.status == "ok":
+        for look, where in self._looks(near):
+            if look == "finer":
+                finer = self._around(search, known[:count], own)
+                if finer is None:
                     break
+                search = self._begun(cloud, view, finer, clock)
+            candidates = search.candidates(more=look != "quick", near=where, given=[*local, *known])
+            known = [h.T_target_source for _, h in candidates]
+            found = [search.look(h, fully=look != "quick") for h in likely(candidates, count)]
+            if not found:
+                continue
+            latest, others = search.decide(found)
+            if best is None or latest.sure or latest.confidence > best.confidence:
+                best, ranked = latest, others
+            if latest.sure:
+                break
         if best is None or best.decision.answer is None:
             return None, []
         decision = best.decision
-        read = (given, self.name), best.pair.clouds, level.voxel_size, view is not None
-        told_of = remarks(*read, preparation, decision.judgement)
+        read = (given, self.name), best.pair.clouds, search.level.voxel_size, view is not None
+        told_of = remarks(*read, self.config.preparation, decision.judgement)
         prior = self._prior_notes(search, decision.T_target_source, near, local)
         for sentence in (*cloud.notes, *prior, *told_of):
             decision = decision.with_note(sentence)
         return replace(best, decision=decision), ranked
+
+    def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
+        """The search for a scan on a level."""
+        clock("prepare")
+        bare = prepare(
+            cloud, level.voxel_size, self.config.preparation, viewpoint=view, seed=self.config.seed
+        )
+        clock("features")
+        scan, compared = described(bare, self._pipeline.descriptor)
+        return Search(self._pipeline, scan, compared, level, self._part(level), clock)
+
+    @cached_property
+    def _extent(self) -> float:
+        return robust_extent(self._voxels.points)
 
     @property
     def _pipeline(self) -> Pipeline:
@@ -373,18 +402,16 @@ class Map:
             self._line.warm_up()
         return self._line
 
-    def _level(self, size: float) -> Level:
-        """The level that suits a scan, made where there is none."""
-        size = max(size, self._voxels.edge)
-
-        def off(level: Level) -> float:
-            return abs(math.log(level.voxel_size / size))
-
-        nearest = min(self._levels, key=off, default=None)
-        if nearest is None or off(nearest) > math.log(_NEAR_SIZE):
-            nearest = Level.of(self._voxels, size, self.config.preparation, seed=self.config.seed)
-            self._levels = tuple(sorted((*self._levels, nearest), key=_size))
-        return nearest
+    def _level(self, size: float, coarser: float = _COARSER) -> Level:
+        """The level for a scan whose own grid has this edge, at most so many times as coarse; made if there is none."""
+        fitting = [x for x in self._levels if size / _FINER <= x.voxel_size <= coarser * size]
+        if not fitting:
+            size = max(size, self._voxels.edge, self._voxels.edge_for(_MOST_POINTS))
+            fitting = [x for x in self._levels if size / _FINER <= x.voxel_size <= size]
+        if not fitting:
+            fitting = [Level.of(self._voxels, size, self.config.preparation)]
+            self._levels = tuple(sorted((*self._levels, *fitting), key=_size))
+        return min(fitting, key=lambda level: abs(math.log(level.voxel_size / size)))
 
     def _part(self, level: Level) -> PreparedCloud:
         nothing = np.zeros((0, 3))
@@ -392,19 +419,31 @@ class Map:
         size = level.voxel_size
         return PreparedCloud(nothing, nothing, None, size, None, origin, self.name, count, scanned=False)
 
-    def _rounds(
+    def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
+        """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
+        if search.level.voxel_size <= _FINER * size or not motions:
+            return None
+        centers = [transform_points(T, search.center[None])[0] for T in motions]
+        around = self._voxels.within(np.array(centers), 2 * search.reach)
+        try:
+            return Level.of(around, max(size, around.edge), self.config.preparation)
+        except EmptyCloudError:
+            return None
+
+    def _looks(
         self, near: tuple[FloatArray, float] | None
-    ) -> list[tuple[bool, tuple[FloatArray, float] | None]]:
-        """How far to look, until something sure is found."""
-        looks: list[tuple[bool, tuple[FloatArray, float] | None]] = [(False, None)]
-        look = self.config.second_look
-        if look.grids or look.max_correspondences:
-            looks.append((True, None))
-        return looks if near is None else [(False, near), *looks]
+    ) -> Iterator[tuple[Look, tuple[FloatArray, float] | None]]:
+        """How closely to look, and where, until something sure is found."""
+        if near is not None:
+            yield "quick", near
+        yield "quick", None
+        if self.config.second_look.grids or self.config.second_look.max_correspondences:
+            yield "more", None
+            yield "finer", None
 
     def _refused(self, cloud: PointCloud) -> str | None:
         """A sentence where scan and map cannot belong together."""
-        extents = robust_extent(cloud.points), robust_extent(self._voxels.points)
+        extents = robust_extent(cloud.points), self._extent
         if extents[0] > _LARGER * extents[1]:
             return (
                 f"the scan is larger than the map (extents {extents[0]:.4g} and {extents[1]:.4g}): give them the other "

@@ -14,8 +14,7 @@ import numpy as np
 
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.surroundings import Surroundings
-from geomoe3d.features.pyramid import one_per_voxel
-from geomoe3d.maps.level import SPACING, Level, Sides
+from geomoe3d.maps.level import Compared, Level
 from geomoe3d.matching.nearest import nearest_features
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import (
@@ -24,14 +23,15 @@ from geomoe3d.types import (
     FloatArray,
     Hypothesis,
     IntArray,
-    PreparedCloud,
 )
 
 _ASKED = 1000  # points of the scan
-_MATCHES, _FINE_MATCHES = 500, 1000  # of a window, from which motions are proposed
-_THRESHOLD, _FINE_THRESHOLD = 3.0, 2.0  # voxels: what is compared first is two apart
-_QUICK = ConsensusEstimator(num_hypotheses=6, num_seeds=250, num_refined=30)
-_FINE = ConsensusEstimator(num_hypotheses=6, num_seeds=500, num_refined=60)
+_MATCHES = 500, 1000  # of a window, from which motions are proposed, at first and later
+_THRESHOLD = 3.0  # voxels: what is compared is two apart
+_ESTIMATORS = (
+    ConsensusEstimator(num_hypotheses=6, num_seeds=250, num_refined=30),
+    ConsensusEstimator(num_hypotheses=6, num_seeds=500, num_refined=60),
+)
 _ROWS = 50
 """Points of the scan whose similarities to all of the map are held at once."""
 
@@ -42,7 +42,7 @@ class Window:
 
     Attributes:
         center: (3,) local coordinates of the map.
-        keys: rows in it of what is compared first.
+        keys: rows in it of what is compared.
         votes: how much better the scan's points match there than elsewhere; larger is likelier.
     """
 
@@ -55,20 +55,14 @@ class Query:
     """A scan's compared points, and how they match the map.
 
     Args:
-        scan: on the level's grid, normals turned to its sensor.
-        features: (n, 99) of its points, by `MultiscaleDescriptor`.
-        level: of the map.
+        scan: normals turned to its sensor.
+        level: of the map, on the scan's grid.
         seed: decides which points are asked.
     """
 
-    def __init__(self, scan: PreparedCloud, features: Float32Array, level: Level, *, seed: int = 0) -> None:
-        rows = one_per_voxel(scan, SPACING)
-        chosen = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_ASKED])
+    def __init__(self, scan: Compared, level: Level, *, seed: int = 0) -> None:
         self.level, self.seed = level, seed
-        of = np.ascontiguousarray(features @ level.directions)
-        self._all = Sides(scan.points, scan.normals, of)
-        some = rows[chosen]
-        self._some = Sides(scan.points[some], scan.normals[some], of[some])
+        self._scan = scan.take(np.sort(np.random.default_rng(seed).permutation(len(scan.points))[:_ASKED]))
         self.radius = float(np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), 0.95))
 
     @single_blas_thread()
@@ -81,7 +75,7 @@ class Query:
         """
         from scipy.spatial import cKDTree
 
-        level, edge, asked = self.level.first, self.radius / 1.5, self._some.features
+        level, edge, asked = self.level.compared, self.radius / 1.5, self._scan.features
         cells = np.floor(level.points / edge).astype(np.int64)
         cells -= cells.min(0)
         shape = cells.max(0) + 1
@@ -121,31 +115,26 @@ class Query:
             found.append(Window(center, np.sort(keys), float(votes[k])))
         return found
 
-    def motions(self, window: Window, count: int, *, fine: bool = False) -> list[Hypothesis]:
+    def motions(self, window: Window, count: int, *, more: bool = False) -> list[Hypothesis]:
         """Motions into a window, best first, T_map_scan (4, 4) local coordinates of both.
 
         Args:
             window: where to.
             count: at most so many.
-            fine: match all points of both, not one per two voxels: five times as long, and more is found.
+            more: from twice as many matches: four times as long, and more is found.
         """
-        if fine:
-            near = self.level.tree.query_ball_point(window.center, 1.3 * self.radius, return_sorted=True)
-            scan, there = self._all, self.level.sides(np.array(near, dtype=np.int64))
-        else:
-            first, keys = self.level.first, window.keys
-            scan, there = self._some, Sides(first.points[keys], first.normals[keys], first.features[keys])
+        scan, there = self._scan, self.level.compared.take(window.keys)
         index, distance, _, mutual = nearest_features(scan.features, there.features, 1, False)
         choice, mutual_first = index[:, 0], mutual[:, 0]
-        rows = np.lexsort((distance[:, 0], ~mutual_first))[: _FINE_MATCHES if fine else _MATCHES]
+        rows = np.lexsort((distance[:, 0], ~mutual_first))[: _MATCHES[more]]
         columns = choice[rows]
         matched = Correspondences(
             np.hstack([scan.points[rows], there.points[columns]]),
             normals=(scan.normals[rows], there.normals[columns]),
             normals_signed=True,
         )
-        threshold = (_FINE_THRESHOLD if fine else _THRESHOLD) * self.level.voxel_size
-        return (_FINE if fine else _QUICK)(
+        threshold = _THRESHOLD * self.level.voxel_size
+        return _ESTIMATORS[more](
             matched.points,
             np.where(mutual_first[rows], 1.0, 0.5),
             inlier_threshold=threshold,

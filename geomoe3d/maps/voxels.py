@@ -81,6 +81,23 @@ class VoxelSums:
         keys = _packed(np.floor_divide(cells, factor))
         return self._of(*_summed(keys, *self._columns()[1:]), edge=self.edge * factor)
 
+    def within(self, centers: FloatArray, radius: float) -> VoxelSums:
+        """Only what lies so near to one of some places (k, 3), local coordinates."""
+        points, near = self.points, np.zeros(len(self), dtype=np.bool_)
+        for center in centers:
+            near |= ((points - center) ** 2).sum(axis=1) <= radius**2
+        return self._of(self.keys[near], self.sums[near], self.counts[near], self.towards[near])
+
+    def edge_for(self, count: int) -> float:
+        """The edge of a grid on which about so many voxels are occupied; at least this one's."""
+        keys, edge, finer = self.keys, self.edge, len(self.keys)
+        while len(keys) > max(count, 1):
+            finer, edge = len(keys), 2 * edge
+            keys = np.unique(_packed(_cells(keys) // 2))
+        if edge == self.edge or finer == len(keys):
+            return edge
+        return edge / 2 * float(2.0 ** (np.log(finer / count) / np.log(finer / len(keys))))
+
     def _keys(self, local: FloatArray) -> IntArray:
         cells = np.floor(local / self.edge)
         if len(cells) and np.abs(cells).max() >= _HALF:

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
         NonFiniteError,
         OutputError,
     )
-    from geomoe3d.maps.map import Location, Map, Place
+    from geomoe3d.maps.location import Location, Place
+    from geomoe3d.maps.map import Map
     from geomoe3d.multiway.run import register_scans
     from geomoe3d.registration import Registrar, register
     from geomoe3d.result import RegistrationResult
@@ -82,9 +83,9 @@ _HOME = {
     "register": "registration",
     "register_correspondences": "correspondence_registration",
     "CorrespondenceResult": "correspondence_registration",
-    "Location": "maps.map",
+    "Location": "maps.location",
     "Map": "maps.map",
-    "Place": "maps.map",
+    "Place": "maps.location",
     "register_pairs": "batch.run",
     "register_scans": "multiway.run",
     "RegistrationResult": "result",

@@ -17,7 +17,7 @@ from geomoe3d.cli.parts import configuration_options
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
-    from geomoe3d.maps.map import Location
+    from geomoe3d.maps.location import Location
 
 
 @click.command(context_settings=HELP, short_help="Find scans in a map, and say how sure.")

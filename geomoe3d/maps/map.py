@@ -2,114 +2,48 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.prepare import (
-    bounded_voxel_size,
     check_cloud,
-    choose_voxel_size,
-    prepare,
     robust_extent,
     round_size,
     typical_spacing,
 )
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, build_config, expert_in_force
 from geomoe3d.decision.answer import failed_result, finished_result
-from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError, InputError
-from geomoe3d.geometry.se3 import check_motion, motions_apart, shift_frames, transform_points
-from geomoe3d.maps.level import Level, described
-from geomoe3d.maps.locate import Found, Search, likely
+from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
+from geomoe3d.maps.finding import FINER, Finder
+from geomoe3d.maps.level import Level
+from geomoe3d.maps.locate import Found
+from geomoe3d.maps.location import Location, Place
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.store import Source, load, save
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.pipeline import Pipeline, resolved
-from geomoe3d.result import RegistrationResult, Status
 from geomoe3d.runtime.timing import Progress, StageClock
-from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
+from geomoe3d.types import FloatArray, PointCloud
 
 _MOST_VOXELS = 4_000_000
-_USUAL_POINTS = (
-    150_000  # at least, where it holds so many: of the grid on which a map is described before any scan
-)
-_USUAL_SHARE = 20  # points of the map for each of that grid
+# The grid on which a map is described before any scan is known: at least so many points, where it holds them, and one
+# of twenty of its own.
+_USUAL_POINTS, _USUAL_SHARE = 150_000, 20
 _MOST_POINTS = 1_000_000  # of any grid: 50 s of processor time, and 150 MB
 _PIECE = 1_000_000
-_FINER, _COARSER = (
-    1.3,
-    2.0,
-)  # a level whose voxels are so many times as small or large as the scan's own serves it
 _CANDIDATES = 4
-Look = Literal["quick", "more", "finer"]
-"""At the likeliest windows; at more of them with more matches; around what was found, on the scan's own grid."""
 NOWHERE = "no place in the map was found at which the scan could lie"
 _LARGER = 3.0  # times the map's extent from which a scan is no part of it
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """One place of a scan in a map.
-
-    Attributes:
-        T_map_scan: (4, 4), p_map = R p_scan + t, file coordinates.
-        relative_score: its score over that of the answer; 1 means as good.
-    """
-
-    T_map_scan: FloatArray
-    relative_score: float
-
-
-@dataclass(frozen=True, eq=False)
-class Location:
-    """Where a scan lies in a map.
-
-    Attributes:
-        result: the answer as of a pair, the scan being the source and the map the target.
-        places: the best clearly different places, the answer first; empty where there is none.
-    """
-
-    result: RegistrationResult
-    places: tuple[Place, ...]
-
-    @property
-    def ok(self) -> bool:
-        """True only for status ok."""
-        return self.result.ok
-
-    @property
-    def status(self) -> Status:
-        """ok | low_confidence | ambiguous | failed, as of a pair."""
-        return self.result.status
-
-    @property
-    def T_map_scan(self) -> FloatArray:
-        """(4, 4), p_map = R p_scan + t, file coordinates; NaN where nothing was found, never the identity."""
-        return self.result.T_target_source
-
-    def to_json(self, indent: int | None = 2) -> str:
-        """The result's JSON with ``places``."""
-        told = json.loads(self.result.to_json())
-        told["places"] = [
-            {
-                "T_map_scan": place.T_map_scan.tolist(),
-                "relative_score": place.relative_score if math.isfinite(place.relative_score) else None,
-            }
-            for place in self.places
-        ]
-        return json.dumps(told, indent=indent, allow_nan=False)
 
 
 class Map:
@@ -259,7 +193,7 @@ class Map:
         if wanted is None:
             usual = min(max(_USUAL_POINTS, self.num_points // _USUAL_SHARE), _MOST_POINTS)
             wanted = round_size(max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge))
-        self._level(wanted, 1.0)
+        self._level(wanted, wanted)
 
     @property
     def num_points(self) -> int:
@@ -314,7 +248,7 @@ class Map:
         if refused is not None:
             return self._nowhere(cloud, refused, clock)
         local = None if asked is None else (asked[0] - self._voxels.origin, asked[1])
-        best, ranked = self._search(cloud, scan, guesses, local, max(k, _CANDIDATES), clock)
+        best, ranked = self._finder(cloud, scan, guesses, local, max(k, _CANDIDATES), clock)
         if best is None or best.decision.answer is None:
             return self._nowhere(cloud, NOWHERE, clock)
         result = finished_result(best.pair, best.decision, self.config, clock.stop())
@@ -325,121 +259,27 @@ class Map:
         )
         return Location(result, places)
 
-    def _search(
-        self,
-        cloud: PointCloud,
-        given: Any,
-        guesses: Sequence[FloatArray],
-        near: tuple[FloatArray, float] | None,
-        count: int,
-        clock: StageClock,
-    ) -> tuple[Found | None, list[Hypothesis]]:
-        """What was decided of a scan, None without any candidate, and the distinct answers, best first.
-
-        Args:
-            cloud: the scan, as loaded.
-            given: the same as the caller gave it.
-            guesses: (4, 4) of T_map_scan, file coordinates.
-            near: as of `Search.candidates`.
-            count: places that are looked at closely, at most.
-            clock: told of the stages.
-        """
-        clock("prepare")
-        rule = self.config.preparation.viewpoint
-        view = find_viewpoints(cloud, cloud, rule)[0]
-        local = [shift_frames(T, -cloud.origin, -self._voxels.origin) for T in guesses]
-        own = self.config.voxel_size or choose_voxel_size(cloud, cloud, self.config.preparation.voxel_points)
-        own = bounded_voxel_size(cloud, cloud, own, self.config.preparation.max_points)
-        level = self._level(own, _COARSER if self.config.voxel_size is None else _FINER)
-        search = self._begun(cloud, view, level, clock)
-        known: list[FloatArray] = []
-        best: Found | None = None
-        ranked: list[Hypothesis] = []
-        for look, where in self._looks(near):
-            if look == "finer":
-                finer = self._around(search, known[:count], own)
-                if finer is None:
-                    break
-                search = self._begun(cloud, view, finer, clock)
-            candidates = search.candidates(more=look != "quick", near=where, given=[*local, *known])
-            known = [h.T_target_source for _, h in candidates]
-            found = [search.look(h, fully=look != "quick") for h in likely(candidates, count)]
-            if not found:
-                continue
-            latest, others = search.decide(found)
-            if best is None or latest.sure or latest.confidence > best.confidence:
-                best, ranked = latest, others
-            if latest.sure:
-                break
-        if best is None or best.decision.answer is None:
-            return None, []
-        decision = best.decision
-        read = (given, self.name), best.pair.clouds, search.level.voxel_size, view is not None
-        told_of = remarks(*read, self.config.preparation, decision.judgement)
-        prior = self._prior_notes(search, decision.T_target_source, near, local)
-        for sentence in (*cloud.notes, *prior, *told_of):
-            decision = decision.with_note(sentence)
-        return replace(best, decision=decision), ranked
-
-    def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
-        """The search for a scan on a level."""
-        clock("prepare")
-        bare = prepare(
-            cloud, level.voxel_size, self.config.preparation, viewpoint=view, seed=self.config.seed
-        )
-        clock("features")
-        scan, compared = described(bare, self._pipeline.descriptor)
-        return Search(self._pipeline, scan, compared, level, self._part(level), clock)
+    @property
+    def _finder(self) -> Finder:
+        if self._line is None:
+            self._line = Pipeline(self.config)
+            self._line.warm_up()
+        return Finder(self._line, self._voxels, self._level, self.name)
 
     @cached_property
     def _extent(self) -> float:
         return robust_extent(self._voxels.points)
 
-    @property
-    def _pipeline(self) -> Pipeline:
-        if self._line is None:
-            self._line = Pipeline(self.config)
-            self._line.warm_up()
-        return self._line
-
-    def _level(self, size: float, coarser: float = _COARSER) -> Level:
-        """The level for a scan whose own grid has this edge, at most so many times as coarse; made if there is none."""
-        fitting = [x for x in self._levels if size / _FINER <= x.voxel_size <= coarser * size]
+    def _level(self, size: float, coarsest: float) -> Level:
+        """The level for a scan that has this grid by itself, at most so coarse; made if there is none."""
+        fitting = [x for x in self._levels if size / FINER <= x.voxel_size <= coarsest]
         if not fitting:
             size = max(size, self._voxels.edge, self._voxels.edge_for(_MOST_POINTS))
-            fitting = [x for x in self._levels if size / _FINER <= x.voxel_size <= size]
+            fitting = [x for x in self._levels if size / FINER <= x.voxel_size <= size]
         if not fitting:
             fitting = [Level.of(self._voxels, size, self.config.preparation)]
             self._levels = tuple(sorted((*self._levels, *fitting), key=_size))
         return min(fitting, key=lambda level: abs(math.log(level.voxel_size / size)))
-
-    def _part(self, level: Level) -> PreparedCloud:
-        nothing = np.zeros((0, 3))
-        origin, count = self._voxels.origin, self.num_points
-        size = level.voxel_size
-        return PreparedCloud(nothing, nothing, None, size, None, origin, self.name, count, scanned=False)
-
-    def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
-        """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
-        if search.level.voxel_size <= _FINER * size or not motions:
-            return None
-        centers = [transform_points(T, search.center[None])[0] for T in motions]
-        around = self._voxels.within(np.array(centers), 2 * search.reach)
-        try:
-            return Level.of(around, max(size, around.edge), self.config.preparation)
-        except EmptyCloudError:
-            return None
-
-    def _looks(
-        self, near: tuple[FloatArray, float] | None
-    ) -> Iterator[tuple[Look, tuple[FloatArray, float] | None]]:
-        """How closely to look, and where, until something sure is found."""
-        if near is not None:
-            yield "quick", near
-        yield "quick", None
-        if self.config.second_look.grids or self.config.second_look.max_correspondences:
-            yield "more", None
-            yield "finer", None
 
     def _refused(self, cloud: PointCloud) -> str | None:
         """A sentence where scan and map cannot belong together."""
@@ -459,24 +299,6 @@ class Map:
     def _nowhere(self, cloud: PointCloud, reason: str, clock: StageClock) -> Location:
         target = PointCloud(self._voxels.points, self._voxels.origin, name=self.name)
         return Location(failed_result((cloud, target), reason, self.config, clock.stop()), ())
-
-    def _prior_notes(
-        self, search: Search, T: FloatArray, near: tuple[FloatArray, float] | None, guesses: list[FloatArray]
-    ) -> list[str]:
-        """Sentences where the answer lies elsewhere than the caller said."""
-        notes = []
-        if near is not None:
-            away = float(np.linalg.norm(transform_points(T, search.eye[None])[0] - near[0]))
-            if away > near[1]:
-                said = f"it lies {away:.3g} away, more than {near[1]:.3g}"
-                notes.append(f"the place that was given is not the answer: {said}")
-        for guess in guesses:
-            shift, turn = motions_apart(T, guess, search.center)
-            if shift > search.reach or turn > 45:
-                notes.append(
-                    f"the first guess is not the answer: it lies {turn:.1f} deg and {shift:.3g} away"
-                )
-        return notes
 
 
 def _size(level: Level) -> float:
@@ -537,4 +359,4 @@ def search_larger(
     nothing = VoxelSums.empty(1.0, np.zeros(3))
     made = Map(nothing, config=line.config, line=line).with_cloud(replace(world, sensor=None))
     guesses = [] if guess is None else [guess]
-    return made._search(scan, scan, guesses, None, _CANDIDATES, clock)[0]
+    return made._finder(scan, scan, guesses, None, _CANDIDATES, clock)[0]

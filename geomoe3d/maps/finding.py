@@ -1,0 +1,168 @@
+"""How a scan is sought in a map: on which grids, how closely, and when to stop.
+
+Coarse grids find more, and sooner; the scan's own grid is then asked around what was found, where the answer is not
+sure yet. That costs what is around, whatever the size of the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from geomoe3d.clouds.prepare import bounded_voxel_size, choose_voxel_size, prepare
+from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.decision.remarks import remarks
+from geomoe3d.errors import EmptyCloudError
+from geomoe3d.geometry.se3 import motions_apart, shift_frames, transform_points
+from geomoe3d.maps.level import Level, described
+from geomoe3d.maps.locate import Found, Search, likely
+from geomoe3d.maps.voxels import VoxelSums
+from geomoe3d.pipeline import Pipeline
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
+
+FINER = 1.3
+"""A level whose voxels are so many times smaller than the scan's own serves it."""
+_LEAST_VOXELS = 600  # that a scan fills on a level that serves it
+Look = Literal["quick", "more", "finer"]
+"""At the likeliest windows; at more of them with more matches; around what was found, on the scan's own grid."""
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds scans in a map.
+
+    Attributes:
+        line: parts of the configuration.
+        voxels: of the map.
+        level_for: gives the level for a scan whose own grid has an edge, and the coarsest one that serves it.
+        name: of the map.
+    """
+
+    line: Pipeline
+    voxels: VoxelSums
+    level_for: Callable[[float, float], Level]
+    name: str
+
+    def __call__(
+        self,
+        cloud: PointCloud,
+        given: Any,
+        guesses: Sequence[FloatArray],
+        near: tuple[FloatArray, float] | None,
+        count: int,
+        clock: StageClock,
+    ) -> tuple[Found | None, list[Hypothesis]]:
+        """What was decided of a scan, None without any candidate, and the distinct answers, best first.
+
+        Args:
+            cloud: the scan, as loaded.
+            given: the same as the caller gave it.
+            guesses: (4, 4) of T_map_scan, file coordinates.
+            near: as of `Search.candidates`.
+            count: places that are looked at closely, at most.
+            clock: told of the stages.
+        """
+        clock("prepare")
+        rule = self.line.config.preparation.viewpoint
+        view = find_viewpoints(cloud, cloud, rule)[0]
+        local = [shift_frames(T, -cloud.origin, -self.voxels.origin) for T in guesses]
+        own, coarsest = self._grids(cloud)
+        level = self.level_for(own, coarsest)
+        search = self._begun(cloud, view, level, clock)
+        known: list[FloatArray] = []
+        best: Found | None = None
+        ranked: list[Hypothesis] = []
+        for look, where in self._looks(near):
+            if look == "finer":
+                finer = self._around(search, known[:count], own)
+                if finer is None:
+                    break
+                search = self._begun(cloud, view, finer, clock)
+            candidates = search.candidates(more=look != "quick", near=where, given=[*local, *known])
+            known = [h.T_target_source for _, h in candidates]
+            found = [search.look(h, fully=look != "quick") for h in likely(candidates, count)]
+            if not found:
+                continue
+            latest, others = search.decide(found)
+            if best is None or latest.sure or latest.confidence > best.confidence:
+                best, ranked = latest, others
+            if latest.sure:
+                break
+        if best is None or best.decision.answer is None:
+            return None, []
+        decision = best.decision
+        read = (given, self.name), best.pair.clouds, search.level.voxel_size, view is not None
+        told_of = remarks(*read, self.line.config.preparation, decision.judgement)
+        prior = self._prior_notes(search, decision.T_target_source, near, local)
+        for sentence in (*cloud.notes, *prior, *told_of):
+            decision = decision.with_note(sentence)
+        return replace(best, decision=decision), ranked
+
+    def _grids(self, cloud: PointCloud) -> tuple[float, float]:
+        """Edges of the grid that suits a scan, and of the coarsest one that serves it."""
+        preparation, given = self.line.config.preparation, self.line.config.voxel_size
+        own = given or choose_voxel_size(cloud, cloud, preparation.voxel_points)
+        own = bounded_voxel_size(cloud, cloud, own, preparation.max_points)
+        if given is not None:
+            return own, FINER * own
+        return own, max(own, choose_voxel_size(cloud, cloud, _LEAST_VOXELS))
+
+    def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
+        """The search for a scan on a level."""
+        clock("prepare")
+        bare = prepare(
+            cloud, level.voxel_size, self.line.config.preparation, viewpoint=view, seed=self.line.config.seed
+        )
+        clock("features")
+        scan, compared = described(bare, self.line.descriptor)
+        return Search(self.line, scan, compared, level, self._part(level), clock)
+
+    def _part(self, level: Level) -> PreparedCloud:
+        nothing = np.zeros((0, 3))
+        origin, count = self.voxels.origin, int(self.voxels.counts.sum())
+        size = level.voxel_size
+        return PreparedCloud(nothing, nothing, None, size, None, origin, self.name, count, scanned=False)
+
+    def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
+        """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
+        if search.level.voxel_size <= FINER * size or not motions:
+            return None
+        centers = [transform_points(T, search.center[None])[0] for T in motions]
+        around = self.voxels.within(np.array(centers), 2 * search.reach)
+        try:
+            return Level.of(around, max(size, around.edge), self.line.config.preparation)
+        except EmptyCloudError:
+            return None
+
+    def _looks(
+        self, near: tuple[FloatArray, float] | None
+    ) -> Iterator[tuple[Look, tuple[FloatArray, float] | None]]:
+        """How closely to look, and where, until something sure is found."""
+        if near is not None:
+            yield "quick", near
+        yield "quick", None
+        if self.line.config.second_look.grids or self.line.config.second_look.max_correspondences:
+            yield "more", None
+            yield "finer", None
+
+    def _prior_notes(
+        self, search: Search, T: FloatArray, near: tuple[FloatArray, float] | None, guesses: list[FloatArray]
+    ) -> list[str]:
+        """Sentences where the answer lies elsewhere than the caller said."""
+        notes = []
+        if near is not None:
+            away = float(np.linalg.norm(transform_points(T, search.eye[None])[0] - near[0]))
+            if away > near[1]:
+                said = f"it lies {away:.3g} away, more than {near[1]:.3g}"
+                notes.append(f"the place that was given is not the answer: {said}")
+        for guess in guesses:
+            shift, turn = motions_apart(T, guess, search.center)
+            if shift > search.reach or turn > 45:
+                notes.append(
+                    f"the first guess is not the answer: it lies {turn:.1f} deg and {shift:.3g} away"
+                )
+        return notes

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from geomoe3d.config import Section
 from geomoe3d.errors import CheckpointError, OutputError
-from geomoe3d.features.learned import LEARNED
+from geomoe3d.features.learned import LEARNED, load_tensors
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.training.descriptor_network import WIDTH, DescriptorNetwork
 from geomoe3d.training.descriptor_pairs import ContrastBatch, ContrastPairs
@@ -43,7 +43,7 @@ class DescriptorTrainConfig(Section):
     steps: int = Field(8000, ge=1, description="updates of the weights")
     batch_size: int = Field(2, ge=1, description="pairs per step")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:1")
-    variants: int = Field(2, ge=1, description="of each fragment: as it is, and with noise and thinned")
+    init_from: str | None = Field(None, description="weights to start from (learned.safetensors)")
     width: int = Field(WIDTH, ge=4, description="channels")
     learning_rate: float = Field(2e-3, gt=0, description="the largest of the schedule")
     weight_decay: float = Field(1e-3, ge=0)
@@ -99,9 +99,11 @@ class DescriptorRun:
         torch.manual_seed(config.seed)
         self.device = choose_device(config.device, Process())
         self.network = DescriptorNetwork(config.width).to(self.device)
+        if config.init_from is not None:
+            self._start_from(Path(config.init_from))
         self.averaged = DescriptorNetwork(config.width).to(self.device).requires_grad_(False)
         self.averaged.load_state_dict(self.network.state_dict())
-        self.log_scale = torch.nn.Parameter(torch.tensor(2.7, device=self.device))
+        self.log_scale = torch.nn.Parameter(torch.tensor(3.2, device=self.device))
         self.optimizer = torch.optim.AdamW(
             [*self.network.parameters(), self.log_scale],
             lr=config.learning_rate,
@@ -151,10 +153,7 @@ class DescriptorRun:
     def _pairs(self, seed: int, leave_out: int) -> ContrastPairs:
         config = self.config
         counts = {"num_shared": config.num_shared, "num_random": config.num_random}
-        variants = config.variants if leave_out >= 0 else 1
-        return ContrastPairs(
-            list(config.data), seed, self.device, leave_out=leave_out, variants=variants, **counts
-        )
+        return ContrastPairs(list(config.data), seed, self.device, leave_out=leave_out, **counts)
 
     def _update(self, batch: ContrastBatch) -> Tensor:
         """One step; loss and share found."""
@@ -190,6 +189,13 @@ class DescriptorRun:
             "optimizer": self.optimizer.state_dict(),
         }
         write_atomically(self.last_path, lambda temporary: torch.save(state, temporary), force=True)
+
+    def _start_from(self, path: Path) -> None:
+        tensors = {name: torch.from_numpy(tensor) for name, tensor in load_tensors(path).items()}
+        try:
+            self.network.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise CheckpointError(f"'{path}' does not fit width {self.config.width}: {error}") from None
 
     def _resume(self) -> None:
         try:

@@ -1,8 +1,8 @@
 """What the learned descriptor is trained on: points of two fragments, and how far each lies from each in truth.
 
-From the shards of ``geomoe3d data features``: their points are those that registration sees; normals, FPFH and
-grids are made anew, of the points as they are and with noise and thinned, when a fragment is first drawn, and kept
-on the device, 1.5 MB each.
+From the shards of ``geomoe3d data features``: their points and FPFH are those that registration sees; normals are
+fitted anew and turned to the sensor at each fragment's origin. A fragment's grids are made when it is first drawn and
+kept on the device, 1.5 MB each.
 """
 
 from __future__ import annotations
@@ -12,13 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from geomoe3d.data.shards import open_shard, shard_folders
+from geomoe3d.clouds.prepare import estimate_normals, orient_normals
+from geomoe3d.config import PreparationConfig
+from geomoe3d.data.shards import DescribedScene, open_shard, shard_folders
 from geomoe3d.errors import InputError
+from geomoe3d.features.pyramid import pyramid
+from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.training.descriptor_views import Fragment, View, batch_view
-from geomoe3d.training.torch_surface import nearest_points
+from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
 _SAME = 0.9  # voxels: a point of the other fragment so near is the same place
 _LEAST_COSINE = 0.5  # of the two normals there
@@ -55,7 +59,6 @@ class ContrastPairs:
         leave_out: so many scenes, the first by name, are not drawn from; negative: only they are.
         num_shared, num_random: points asked of each fragment; where fewer are shared some are asked twice.
         flipped: share of the pairs whose normals are all turned over, as where a guess of the sensors failed.
-        variants: of every fragment; the first as it is, the others with noise and thinned.
 
     Raises:
         InputError: no shards, or no scene is left.
@@ -72,17 +75,16 @@ class ContrastPairs:
         num_shared: int = 300,
         num_random: int = 500,
         flipped: float = 0.1,
-        variants: int = 2,
     ) -> None:
         paths = [path for folder in folders for path in shard_folders(Path(folder))]
         paths = paths[:-leave_out] if leave_out < 0 else paths[leave_out:]
         if not paths:
             raise InputError(f"no scene is left of {folders} when {abs(leave_out)} are left out")
         self._scenes = [scene for path in paths if len((scene := open_shard(path)).pair)]
-        self._seed, self._device, self._flipped, self._variants = seed, device, flipped, variants
+        self._seed, self._device, self._flipped = seed, device, flipped
         self._num_shared, self._num_random = num_shared, num_random
-        self._fragments: dict[tuple[int, int, int], Fragment | None] = {}
-        self._same: dict[tuple[int, int, int, int], tuple[Tensor, Tensor]] = {}
+        self._fragments: dict[tuple[int, int], Fragment | None] = {}
+        self._same: dict[tuple[int, int], tuple[IntArray, IntArray]] = {}
 
     def batch(self, number: int, size: int) -> ContrastBatch:
         """``size`` pairs."""
@@ -109,49 +111,61 @@ class ContrastPairs:
         scene = self._scenes[k]
         often = np.select([scene.overlap < most for most, _ in _BANDS], [share for _, share in _BANDS])
         row = int(rng.choice(len(often), p=often / often.sum()))
-        first_kind, second_kind = (int(kind) for kind in rng.integers(self._variants, size=2))
-        draw = torch.Generator().manual_seed(int(rng.integers(1 << 62)))
-        flip = rng.random() < self._flipped
         i, j = (int(index) for index in scene.pair[row])
-        source, target = self._fragment(k, i, first_kind), self._fragment(k, j, second_kind)
+        source, target = self._fragment(k, i), self._fragment(k, j)
         if source is None or target is None:
             return None
-        T = torch.tensor(scene.T_target_source[row], dtype=torch.float32, device=self._device)
-        fine = source.grids[0], target.grids[0]
-        moved = fine[0].points @ T[:3, :3].T + T[:3, 3] / scene.voxel_size
-        key = k, row, first_kind, second_kind
-        if key not in self._same:
-            distance, near = (x[:, 0] for x in nearest_points(moved, fine[1].points, 1))
-            alike = (fine[0].normals @ T[:3, :3].T * fine[1].normals[near]).sum(1) > _LEAST_COSINE
-            same = torch.nonzero((distance < _SAME) & alike)[:, 0]
-            self._same[key] = same, near[same]
-        same, near = self._same[key]
+        T = scene.T_target_source[row]
+        moved = transform_points(T, scene.fragment(i)[0].astype(np.float64)) / scene.voxel_size
+        there = scene.fragment(j)[0].astype(np.float64) / scene.voxel_size
+        if (k, row) not in self._same:
+            normals = (
+                source.grids[0].normals.cpu().numpy() @ T[:3, :3].T,
+                target.grids[0].normals.cpu().numpy(),
+            )
+            self._same[k, row] = _same_places(moved, there, *normals)
+        same, near = self._same[k, row]
         if len(same) < _LEAST_SHARED:
             return None
-        first = torch.rand(len(same), generator=draw).argsort()[: self._num_shared]
-        first = first[torch.arange(self._num_shared) % len(first)].to(self._device)
-        queries = []
-        for shared, grid in ((same[first], fine[0]), (near[first], fine[1])):
-            more = torch.randint(len(grid.points), (self._num_random,), generator=draw).to(self._device)
-            queries.append(torch.cat([shared, more]))
-        if flip:
+        first = np.resize(rng.permutation(len(same)), self._num_shared)
+        queries = [
+            np.concatenate([shared[first], rng.integers(len(points), size=self._num_random)])
+            for shared, points in ((same, moved), (near, there))
+        ]
+        places = moved[queries[0]], there[queries[1]]
+        if rng.random() < self._flipped:
             source, target = source.turned_over(), target.turned_over()
-        return (source, target), tuple(queries), (moved[queries[0]], fine[1].points[queries[1]])
+        return (
+            (source, target),
+            tuple(torch.from_numpy(rows).to(self._device) for rows in queries),
+            tuple(torch.from_numpy(x).float().to(self._device) for x in places),
+        )
 
-    def _fragment(self, scene: int, index: int, variant: int) -> Fragment | None:
-        key = scene, index, variant
+    def _fragment(self, scene: int, index: int) -> Fragment | None:
+        key = scene, index
         if key not in self._fragments:
-            self._fragments[key] = self._build(*key)
+            whole = self._scenes[scene]
+            levels = pyramid(as_prepared(whole, index), whole.fragment(index)[1].astype(np.float32))
+            self._fragments[key] = Fragment.of(levels, self._device)
         return self._fragments[key]
 
-    def _build(self, scene: int, index: int, variant: int) -> Fragment | None:
-        rng = np.random.default_rng((self._seed, 5, scene, index, variant))
-        whole = self._scenes[scene]
-        points = whole.fragment(index)[0].astype(np.float64) / whole.voxel_size
-        corner, turn = np.zeros(3), np.eye(3)
-        if variant > 0:
-            corner, turn = rng.uniform(0, 4, 3), Rotation.random(random_state=rng).as_matrix()
-            points = points[rng.random(len(points)) < rng.uniform(_LEAST_KEPT, 1)]
-            points = points + rng.normal(0, rng.uniform(0, _MOST_NOISE), points.shape)
-        given = (points, np.zeros(3), corner, turn)
-        return Fragment.build(*(torch.from_numpy(x).float().to(self._device) for x in given))
+
+def as_prepared(scene: DescribedScene, fragment: int) -> PreparedCloud:
+    """A fragment as registration prepares it, its sensor at the origin."""
+    config = PreparationConfig()
+    points = scene.fragment(fragment)[0].astype(np.float64)
+    normals = estimate_normals(points, config.normal_radius * scene.voxel_size, config.normal_neighbors)
+    origin = np.zeros(3)
+    turned = orient_normals(points, normals, origin)
+    return PreparedCloud(points, turned, None, scene.voxel_size, viewpoint=origin, origin=origin)
+
+
+def _same_places(
+    moved: FloatArray, there: FloatArray, normals: FloatArray, normals_there: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Rows of points of either fragment that are one place: near each other, and facing the same way."""
+    distance, near = map(np.asarray, cKDTree(there).query(moved, distance_upper_bound=_SAME))
+    same = np.flatnonzero(np.isfinite(distance))
+    cosine = np.einsum("ij,ij->i", normals[same], normals_there[near[same]])
+    same = same[cosine > _LEAST_COSINE]
+    return same, near[same]

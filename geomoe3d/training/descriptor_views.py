@@ -1,6 +1,7 @@
 """What the descriptor's network is shown: fragments on three grids, and views of many of them in one batch.
 
-`Fragment` is made from bare points in torch, `View.of` from what registration has; both hold the same.
+`Fragment` holds a whole pyramid as tensors on one device, from which views at ever other points are quick to take;
+`View.of` goes straight from a pyramid to one view.
 """
 
 from __future__ import annotations
@@ -10,10 +11,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from geomoe3d.config import DescriptorConfig, PreparationConfig
 from geomoe3d.features.learned import NUM_NEIGHBORS
 from geomoe3d.features.pyramid import FACTORS, Level, nearest, relations
-from geomoe3d.training.torch_surface import fpfh, nearest_points, plane_normals
 from geomoe3d.types import IntArray
 
 LOOKS = {
@@ -78,37 +77,20 @@ class Fragment:
     rows: dict[str, Tensor]
 
     @classmethod
-    def build(cls, points: Tensor, sensor: Tensor, corner: Tensor, turn: Tensor) -> Fragment | None:
-        """From bare points; None where the coarsest grid is too small to look around in.
-
-        Args:
-            points: (n, 3) float32, in voxels.
-            sensor: (3,) where it stood, in voxels.
-            corner, turn: (3,) and (3, 3), how the coarser grids lie.
-        """
-        preparation, describe = PreparationConfig(), DescriptorConfig()
-        near = nearest_points(points, points, describe.neighbors)
-        few = near[0][:, : preparation.normal_neighbors], near[1][:, : preparation.normal_neighbors]
-        normals = plane_normals(points, preparation.normal_radius, few)
-        normals = torch.where(((sensor - points) * normals).sum(1, keepdim=True) < 0, -normals, normals)
-        own = fpfh(points, normals, describe.radius, near)
-        grids = []
-        for edge in FACTORS:
-            rows = torch.arange(len(points), device=points.device)
-            if edge > 1:
-                rows = first_of_voxels(points @ turn.T + corner, edge)
-                if len(rows) < NUM_NEIGHBORS:
-                    return None
-            some = points[rows], normals[rows]
-            given = own[rows]
-            if edge > 1:
-                near = nearest_points(some[0], some[0], describe.neighbors)
-                wide = fpfh(*some, describe.radius * edge, near)
-                given = torch.cat([given, wide], 1)
-            grids.append(Grid(*some, given.half(), edge))
+    def of(cls, levels: tuple[Level, ...], device: torch.device | str) -> Fragment | None:
+        """Of a pyramid; None where its coarsest level is too small to look around in."""
+        if len(levels[-1]) < NUM_NEIGHBORS:
+            return None
+        grids, own = [], torch.from_numpy(levels[0].features)
+        for level in levels:
+            given = torch.from_numpy(level.features)
+            if level.edge > 1:
+                given = torch.cat([own[torch.from_numpy(level.rows)], given], 1)
+            points, normals = (torch.from_numpy(x).to(device) for x in (level.points, level.normals))
+            grids.append(Grid(points, normals, given.half().to(device), level.edge))
         fine, middle, coarse = grids
         looked = {
-            name: nearest_points(grids[at].points, grids[of].points, NUM_NEIGHBORS)[1].int()
+            name: torch.from_numpy(nearest(levels[at], levels[of], NUM_NEIGHBORS)[1]).int().to(device)
             for name, (at, of) in LOOKS.items()
         }
         return cls((fine, middle, coarse), looked)
@@ -167,11 +149,3 @@ def torch_relations(at: Grid, of: Grid, rows: Tensor) -> Tensor:
     triple = (here * torch.linalg.cross(way, there)).sum(2)
     found = [distance, over_here, over_there, (there * here).sum(2), triple]
     return torch.stack([*found, over_here / distance, over_there / distance, squared], 2)
-
-
-def first_of_voxels(points: Tensor, edge: float) -> Tensor:
-    """Rows of the first point in every voxel of a grid, rising."""
-    _, which = torch.unique((points / edge).floor().long(), dim=0, return_inverse=True)
-    first = torch.full((int(which.max()) + 1,), len(points), device=points.device)
-    rows = torch.arange(len(points), device=points.device)
-    return first.scatter_reduce(0, which, rows, "amin").sort().values

@@ -19,6 +19,8 @@ VERBS = (
     "register",
     "batch",
     "multiway",
+    "pose",
+    "homography",
     "index",
     "locate",
     "evaluate",

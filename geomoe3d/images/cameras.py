@@ -69,8 +69,9 @@ class Camera:
 
     def side(self, pixels: FloatArray) -> float:
         """Longer side of the image in focal lengths; without a known size the extent of pixels (N, 2)."""
-        longer = max(self.size) if self.size is not None else float(np.ptp(pixels, axis=0).max())
-        return longer / self.focal
+        if self.size is not None:
+            return max(self.size) / self.focal
+        return max(float(np.ptp(pixels, axis=0).max()), 1.0) / self.focal if len(pixels) else 1.0
 
     def normalise(self, pixels: FloatArray) -> FloatArray:
         """Pixels (N, 2) to rays (N, 2), x = (u - c) / f with the distortion undone."""

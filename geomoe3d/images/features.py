@@ -133,3 +133,20 @@ def match(first: Keypoints, second: Keypoints) -> Matches:
     distances = [np.sqrt(np.maximum(2.0 - 2.0 * value.astype(np.float64), 0.0)) for value in (best, other)]
     ratio = distances[0] / np.maximum(distances[1], 1e-12)
     return Matches(np.hstack([first.pixels, second.pixels[nearest]]), ratio, mutual)
+
+
+def checked(
+    pixels: FloatArray, weights: FloatArray | None, threshold: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Matches (N, 4) and their weights (N,), 0 for rows that are not finite and 1 where none are given.
+
+    Raises:
+        InputError: shapes do not fit, or a threshold that is not positive.
+    """
+    points = np.asarray(pixels, dtype=np.float64)
+    w = np.ones(len(points)) if weights is None else np.nan_to_num(np.asarray(weights, dtype=np.float64))
+    if points.ndim != 2 or points.shape[1] != 4 or w.shape != (len(points),):
+        raise InputError(f"matches must be (N, 4) and weights (N,), found {points.shape} and {w.shape}")
+    if threshold is not None and not (np.isfinite(threshold) and threshold > 0):
+        raise InputError(f"the inlier threshold must be positive, found {threshold} pixels")
+    return points, np.where(np.isfinite(points).all(axis=1), w, 0.0)

@@ -246,5 +246,5 @@ def _matrix(rows: Any) -> FloatArray:
 def _size(path: Path) -> tuple[int, int]:
     from geomoe3d.images.features import read_grey
 
-    height, width = read_grey(path).shape
+    height, width = read_grey(path).shape if path.is_file() else (1, 1)  # a lost image is left out later
     return width, height

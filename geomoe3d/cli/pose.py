@@ -1,0 +1,203 @@
+"""``geomoe3d pose`` and ``geomoe3d homography``: two photographs in, how they lie to each other out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+
+if TYPE_CHECKING:
+    from geomoe3d.images.cameras import Camera
+    from geomoe3d.images.features import Matches
+    from geomoe3d.images.network import Verdict
+    from geomoe3d.types import BoolArray, FloatArray
+
+
+def _shared(estimators: tuple[str, ...]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(
+            (
+                click.argument("image0", type=click.Path()),
+                click.argument("image1", type=click.Path()),
+                click.option("--detector", default="rootsift", show_default=True,
+                             type=click.Choice(("rootsift", "sift", "orb"))),
+                click.option("--keypoints", default=2000, show_default=True, type=click.IntRange(min=8),
+                             help="Most per image."),
+                click.option("--matches", type=click.Choice(("distinct", "mutual", "all")),
+                             help="Which nearest neighbours are used; distinct: mutual ones that pass the ratio "
+                             "test. [distinct; all with --weights]"),
+                click.option("--weights", type=click.Path(), help="Network that rejects wrong matches "
+                             "(.safetensors, see configs/train/images)."),
+                click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators)),
+                click.option("--threshold", type=click.FloatRange(min=0, min_open=True),
+                             help="Inlier threshold, pixels."),
+                click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0)),
+                click.option("--output", type=click.Path(), help="Write the answer as JSON."),
+                click.option("--picture", type=click.Path(), help="Draw the matches (.png, .jpg, .pdf, .svg)."),
+                click.option("--force", is_flag=True, help="Replace files that exist."),
+            )
+        ):  # fmt: skip
+            function = option(function)
+        return function
+
+    return decorate
+
+
+@click.command(context_settings=HELP)
+@_shared(("magsac", "ransac", "eight_point"))
+@click.option("--intrinsics", metavar="FX,FY,CX,CY",
+              help="Of both cameras, pixels; four distortions k1,k2,p1,p2 may follow; or a folder of photographs "
+              "with cameras that holds both. [guessed: the answer is never 'ok']")  # fmt: skip
+@click.option("--intrinsics1", metavar="FX,FY,CX,CY", help="Of IMAGE1, where it has another camera.")
+@traceback_option
+@click.pass_context
+def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str | None, **given: Any) -> None:
+    """Relative pose of the camera of IMAGE1 from that of IMAGE0: X1 = R X0 + t, t of unit length.
+
+    Camera frames: x right, y down, z forward. Exit code 0 for the status ok, 3 for any other, 2 for bad input.
+    """
+    import numpy as np
+
+    from geomoe3d.images.pose import find_pose
+
+    matches, sizes = _matches(given)
+    paths = (Path(given["image0"]), Path(given["image1"]))
+    first = _camera(intrinsics, paths[0], sizes[0])
+    second = _camera(intrinsics1 or intrinsics, paths[1], sizes[1])
+    rays = np.hstack(
+        [c.normalise(matches.pixels[:, 2 * k : 2 * k + 2]) for k, c in enumerate((first, second))]
+    )
+    weights, verdict = _weights(given["weights"], rays)
+    result = find_pose(
+        matches.pixels, (first, second), weights=weights, estimator=given["estimator"], threshold=given["threshold"],
+        seed=given["seed"],
+    )  # fmt: skip
+    status, reasons = result.status, list(result.reasons)
+    if intrinsics is None:
+        reasons.append("the focal length is a guess (--intrinsics)")
+        status = "low_confidence" if status == "ok" else status
+    _tell(
+        context, given, matches, result.inliers, result.residuals, status, reasons, verdict,
+        {"R": result.R, "t": result.t, "parallax": result.parallax, "alternatives": list(result.alternatives)},
+    )  # fmt: skip
+
+
+@click.command(context_settings=HELP)
+@_shared(("magsac", "ransac", "dlt"))
+@traceback_option
+@click.pass_context
+def homography(context: click.Context, /, **given: Any) -> None:
+    """Homography from IMAGE0 to IMAGE1, of a plane or of photographs from one place: pixel1 ~ H pixel0.
+
+    Exit code 0 for the status ok, 3 for any other, 2 for bad input.
+    """
+    import numpy as np
+
+    from geomoe3d.images.cameras import Camera
+    from geomoe3d.images.homography import THRESHOLD, find_homography
+
+    matches, sizes = _matches(given)
+    rays = np.hstack([
+        Camera.guess(*size).normalise(matches.pixels[:, 2 * k : 2 * k + 2]) for k, size in enumerate(sizes)
+    ])  # fmt: skip
+    weights, verdict = _weights(given["weights"], rays)
+    result = find_homography(
+        matches.pixels, weights=weights, estimator=given["estimator"], threshold=given["threshold"] or THRESHOLD,
+        seed=given["seed"],
+    )  # fmt: skip
+    _tell(context, given, matches, result.inliers, result.residuals, result.status, list(result.reasons), verdict,
+          {"H": result.H})  # fmt: skip
+
+
+def _matches(given: dict[str, Any]) -> tuple[Matches, list[tuple[int, int]]]:
+    from geomoe3d.images.features import detect, match
+    from geomoe3d.runtime.files import check_output
+
+    for name in ("output", "picture"):
+        if given[name] is not None:
+            check_output(given[name], force=given["force"])
+    keypoints = [detect(given[name], given["detector"], given["keypoints"]) for name in ("image0", "image1")]
+    found = match(*keypoints)
+    which = given["matches"] or ("all" if given["weights"] else "distinct")
+    chosen = {"all": found, "mutual": found.take(found.mutual), "distinct": found.distinct()}[which]
+    return chosen, [one.size for one in keypoints]
+
+
+def _weights(path: str | None, rays: FloatArray) -> tuple[FloatArray | None, Verdict | None]:
+    if path is None:
+        return None, None
+    import numpy as np
+
+    from geomoe3d.images.network import ImageNetwork
+
+    verdict = ImageNetwork(path)(rays)
+    return np.maximum(np.tanh(verdict.logits), 0.0), verdict
+
+
+def _camera(text: str | None, image: Path, size: tuple[int, int]) -> Camera:
+    from geomoe3d.errors import InputError
+    from geomoe3d.images.cameras import Camera
+    from geomoe3d.images.scenes import read_scene
+
+    if text is None:
+        return Camera.guess(*size)
+    if Path(text).is_dir():
+        for view in read_scene(text).views:
+            if view.path.resolve() == image.resolve():
+                return view.camera
+        raise InputError(f"'{image}' is none of the photographs of '{text}'; give its intrinsics as numbers")
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 8):
+        raise InputError(f"'{text}' is no folder, and not fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2")
+    k1, k2, p1, p2 = numbers[4:] or (0.0,) * 4
+    fx, fy, cx, cy = numbers[:4]
+    return Camera(fx, fy, cx, cy, (k1, k2, p1, p2), size)
+
+
+def _tell(
+    context: click.Context, given: dict[str, Any], matches: Matches, inliers: BoolArray, residuals: FloatArray,
+    status: str, reasons: list[str], verdict: Verdict | None, answer: dict[str, Any],
+) -> None:  # fmt: skip
+    import numpy as np
+
+    from geomoe3d.images.features import read_grey
+    from geomoe3d.images.picture import save_matches
+    from geomoe3d.runtime.files import write_text
+
+    click.echo(f"status: {status}")
+    for reason in reasons:
+        click.echo(f"  {reason}")
+    for name, value in answer.items():
+        if isinstance(value, np.ndarray):
+            rows = np.array2string(value, precision=6, suppress_small=True, prefix=" " * 4)
+            click.echo(f"{name} = {rows}")
+    middle = f", median residual {np.median(residuals[inliers]):.2f} pixels" if inliers.any() else ""
+    click.echo(f"{inliers.sum()} inliers of {len(matches)} matches{middle}")
+    if given["output"] is not None:
+        plain = {
+            name: np.asarray(value).tolist() if value is not None else None for name, value in answer.items()
+        }
+        whole = {"status": status, "reasons": reasons, **plain, "matches": len(matches),
+                 "inliers": np.flatnonzero(inliers).tolist()}  # fmt: skip
+        write_text(Path(given["output"]), json.dumps(whole, indent=2) + "\n", force=given["force"])
+    if given["picture"] is not None:
+        images = (read_grey(given["image0"]), read_grey(given["image1"]))
+        sub_field, expert = (None, None) if verdict is None else verdict[1:]
+        save_matches(
+            given["picture"],
+            images,
+            matches.pixels,
+            inliers,
+            sub_field=sub_field,
+            expert=expert,
+            force=given["force"],
+        )
+    context.exit(0 if status == "ok" else NOT_SURE)

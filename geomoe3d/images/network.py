@@ -1,0 +1,62 @@
+"""A trained network that weighs the matches of two images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from geomoe3d.errors import CheckpointError
+from geomoe3d.images.epipolar import MIN_MATCHES
+from geomoe3d.images.generate import neighbors_of
+from geomoe3d.networks.pretrained import load_network
+from geomoe3d.types import FloatArray, IntArray
+
+
+class Verdict(NamedTuple):
+    """What a network says of N matches.
+
+    Attributes:
+        logits: (N,), above 0 for inliers.
+        sub_field: (N,) the sub-field from which each match is mostly rebuilt, or None (GeoMoE alone has them).
+        expert: (N,) the expert with the largest weight for that sub-field, or None.
+    """
+
+    logits: FloatArray
+    sub_field: IntArray | None
+    expert: IntArray | None
+
+
+class ImageNetwork:
+    """GeoMoE or one of its baselines with 4D input, loaded once.
+
+    Args:
+        weights: a .safetensors file with its card beside it.
+
+    Raises:
+        CheckpointError: not found, damaged, or a network for clouds.
+    """
+
+    def __init__(self, weights: str | Path) -> None:
+        self.model, self.card = load_network(weights)
+        if self.model.config.correspondence_dim != 4:
+            raise CheckpointError(
+                f"'{weights}' holds a network for clouds; matches of images need one with 4D input, trained by "
+                "configs/train/images"
+            )
+
+    @torch.no_grad()
+    def __call__(self, rays: FloatArray) -> Verdict:
+        """Weigh matches (N, 4), finite and normalised by the intrinsics; with fewer than eight all logits are 0."""
+        if len(rays) < MIN_MATCHES:
+            return Verdict(torch.zeros(len(rays)).numpy(), None, None)
+        x = torch.from_numpy(rays).float()[None]
+        neighbors = neighbors_of(x, min(self.model.config.num_neighbors, len(rays)))
+        out = self.model(x, None, neighbors, insight=True)
+        last = out.insights[-1] if out.insights else None
+        sub_field = None if last is None else last.sub_field[0].numpy()
+        expert = None
+        if last is not None and last.expert is not None:
+            expert = last.expert[0].numpy()[sub_field]
+        return Verdict(out.logits[-1, 0].double().numpy(), sub_field, expert)

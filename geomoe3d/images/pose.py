@@ -1,0 +1,248 @@
+"""From matches of two images to the relative pose, with a word on how sure it is.
+
+Matches, kept ones or all, go to an estimator: the weighted eight-point algorithm, OpenCV's five-point RANSAC or
+its MAGSAC++. Of the poses that an essential matrix allows, the one with the points before both cameras is taken.
+What two images cannot tell is looked for afterwards: a translation where the cameras only turned or hardly moved,
+a single pose where all inliers lie in one plane, and agreement that chance would give as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from geomoe3d.errors import InputError
+from geomoe3d.images.cameras import Camera, opencv, rotation_deg
+from geomoe3d.images.epipolar import (
+    MIN_MATCHES,
+    decompose,
+    depths,
+    essential_of,
+    symmetric_distance,
+    weighted_eight_point,
+)
+from geomoe3d.images.features import checked
+from geomoe3d.types import BoolArray, FloatArray
+
+Estimator = Literal["magsac", "ransac", "eight_point"]
+PIXEL_SHARE = 1.0 / 800
+"""Default inlier threshold, a share of the image's longer side: one pixel of the image as keypoints are sought."""
+
+_MOST_SAMPLES, _CONFIDENCE = 2_000, 0.99999
+_LEAST_INLIERS = 20
+_OVER_CHANCE = 3.0
+_EXPLAINED, _OTHER_POSE_DEG = 0.9, 3.0
+_LEAST_PARALLAX = 3.0
+
+
+@dataclass(frozen=True)
+class PoseResult:
+    """The answer for two images.
+
+    Attributes:
+        status: ``ok``; ``ambiguous``: more than one pose fits, or the translation is not fixed;
+            ``low_confidence``: it may be wrong; ``failed``: there is none.
+        reasons: why it is not ok, sentences.
+        R: (3, 3), X1 = R X0 + t in the cameras' frames (x right, y down, z forward); None where failed.
+        t: (3,) of unit length: two images do not tell how far the camera moved; None where failed.
+        inliers: (N,) bool, matches within the threshold of their epipolar lines, before both cameras.
+        residuals: (N,) root of the mean squared distance to both epipolar lines, pixels; inf where failed.
+        parallax: median distance in pixels by which inliers moved beyond the best rotation alone.
+        alternatives: other poses (4, 4) that fit as well, for a planar scene.
+    """
+
+    status: Literal["ok", "low_confidence", "ambiguous", "failed"]
+    reasons: tuple[str, ...]
+    R: FloatArray | None
+    t: FloatArray | None
+    inliers: BoolArray
+    residuals: FloatArray
+    parallax: float = 0.0
+    alternatives: tuple[FloatArray, ...] = ()
+
+    @property
+    def T(self) -> FloatArray | None:
+        """(4, 4) of R and t, or None where failed."""
+        if self.R is None or self.t is None:
+            return None
+        return np.vstack([np.column_stack([self.R, self.t]), [0, 0, 0, 1]])
+
+
+def find_pose(
+    pixels: FloatArray,
+    cameras: tuple[Camera, Camera],
+    *,
+    weights: FloatArray | None = None,
+    estimator: Estimator = "magsac",
+    threshold: float | None = None,
+    seed: int = 0,
+) -> PoseResult:
+    """The pose of the second camera from matches.
+
+    Args:
+        pixels: (N, 4) rows [u0, v0, u1, v1]; rows that are not finite are never inliers.
+        cameras: of both images.
+        weights: (N,) in [0, 1] from a network; those above 0 are kept. None keeps all alike.
+        estimator: ``eight_point`` uses the weights themselves, the others which are kept.
+        threshold: inlier threshold in pixels; None: 1/800 of the image's longer side.
+        seed: of the random samples.
+
+    Raises:
+        InputError: shapes do not fit, a threshold that is not positive, or an unknown estimator.
+    """
+    pixels, w = checked(pixels, weights, threshold)
+    usable = np.isfinite(pixels).all(axis=1)
+    focal = (cameras[0].focal + cameras[1].focal) / 2
+    if threshold is None:
+        sides = [camera.side(pixels[usable, 2 * k : 2 * k + 2]) for k, camera in enumerate(cameras)]
+        threshold = PIXEL_SHARE * focal * max(sides)
+    rays = np.full_like(pixels, np.nan)
+    for k, camera in enumerate(cameras):
+        rays[usable, 2 * k : 2 * k + 2] = camera.normalise(pixels[usable, 2 * k : 2 * k + 2])
+    kept = w > 0
+    if kept.sum() < MIN_MATCHES:
+        return _failed(
+            len(pixels), f"{kept.sum()} matches are kept of {len(pixels)}; at least {MIN_MATCHES} are needed"
+        )
+    T = _estimate(rays[kept], w[kept], estimator, threshold / focal, seed)
+    if T is None:
+        return _failed(
+            len(pixels), "no essential matrix fits: the matches fix none, as where all lie on a line"
+        )
+    residuals = np.full(len(pixels), np.inf)
+    residuals[usable] = residuals_of(T, rays[usable]) * focal
+    front = np.zeros(len(pixels), dtype=bool)
+    front[usable] = before_both(T, rays[usable])
+    inliers = kept & front & (residuals < threshold)
+    return _judged(T, rays, inliers, residuals, kept, threshold / focal, focal)
+
+
+def residuals_of(T: FloatArray, rays: FloatArray) -> FloatArray:
+    """(N,) root of the mean squared distance to both epipolar lines, focal lengths."""
+    square = symmetric_distance(essential_of(torch.from_numpy(T)), torch.from_numpy(rays))
+    return np.sqrt(square.numpy() / 2)
+
+
+def before_both(T: FloatArray, rays: FloatArray) -> BoolArray:
+    """(N,) whether a match lies before both cameras."""
+    z0, z1 = depths(torch.from_numpy(T), torch.from_numpy(rays))
+    return ((z0 > 0) & (z1 > 0)).numpy()
+
+
+def _estimate(
+    rays: FloatArray, w: FloatArray, estimator: str, threshold: float, seed: int
+) -> FloatArray | None:
+    x, weights = torch.from_numpy(rays)[None], torch.from_numpy(w)[None]
+    if estimator == "eight_point":
+        fit = weighted_eight_point(x, weights)
+        return decompose(fit.E, x, weights)[0].numpy() if bool(fit.valid[0]) else None
+    cv2 = opencv()
+    if estimator not in ("ransac", "magsac"):
+        raise InputError(f"there is no estimator '{estimator}'; there are magsac, ransac and eight_point")
+    first, second = (np.ascontiguousarray(rays[:, k : k + 2]) for k in (0, 2))
+    cv2.setRNGSeed(seed)
+    method = cv2.RANSAC if estimator == "ransac" else cv2.USAC_MAGSAC
+    try:
+        found, _ = cv2.findEssentialMat(
+            first,
+            second,
+            np.eye(3),
+            method=method,
+            prob=_CONFIDENCE,
+            threshold=threshold,
+            maxIters=_MOST_SAMPLES,
+        )
+    except cv2.error:  # raised where no sample gives a matrix
+        return None
+    if found is None or len(found) < 3 or not np.isfinite(found).all():
+        return None
+    # Five points alone may leave several matrices; the one that most matches agree with is meant.
+    poses = [
+        decompose(torch.from_numpy(found[k : k + 3])[None], x, weights)[0].numpy()
+        for k in range(0, len(found), 3)
+    ]
+    return max(poses, key=lambda T: int(((residuals_of(T, rays) < threshold) & before_both(T, rays)).sum()))
+
+
+def _judged(
+    T: FloatArray, rays: FloatArray, inliers: BoolArray, residuals: FloatArray, kept: BoolArray, threshold: float,
+    focal: float,
+) -> PoseResult:  # fmt: skip
+    """What the inliers say of the pose."""
+    found = int(inliers.sum())
+    reasons, ambiguous, parallax = [], False, 0.0
+    alternatives: tuple[FloatArray, ...] = ()
+    if found < _LEAST_INLIERS:
+        reasons.append(f"{found} inliers; below {_LEAST_INLIERS} a wrong pose finds as many")
+    if found >= MIN_MATCHES:
+        chance = _by_chance(T, rays[kept], threshold) * kept.sum()
+        if found < _OVER_CHANCE * chance + _LEAST_INLIERS:
+            reasons.append(
+                f"{found} inliers, where matches shuffled at random have {chance:.0f} under this pose"
+            )
+        x = rays[inliers]
+        turned = _turned(x)
+        beyond = np.linalg.norm(turned[:, :2] - x[:, 2:], axis=1)
+        parallax = float(np.median(beyond))
+        if parallax < _LEAST_PARALLAX * threshold:
+            ambiguous = True
+            reasons.append(
+                f"the inliers move by {parallax * focal:.1f} pixels beyond a rotation: the camera only turned, or its "
+                "way is short beside the distance of the scene; R holds, t does not"
+            )
+        else:
+            alternatives = _of_a_plane(T, x, threshold)
+            if alternatives:
+                ambiguous = True
+                reasons.append("nearly all inliers lie in one plane, and a second pose explains them as well")
+    status: Literal["ok", "low_confidence", "ambiguous"] = "ok"
+    if reasons:
+        status = "ambiguous" if ambiguous and len(reasons) == 1 else "low_confidence"
+    return PoseResult(
+        status, tuple(reasons), T[:3, :3], T[:3, 3], inliers, residuals, parallax * focal, alternatives
+    )
+
+
+def _by_chance(T: FloatArray, rays: FloatArray, threshold: float, rounds: int = 20) -> float:
+    """Share of matches that agree with a pose after their second points were exchanged at random."""
+    rng = np.random.default_rng(0)
+    shuffled = np.concatenate([np.hstack([rays[:, :2], rng.permutation(rays[:, 2:])]) for _ in range(rounds)])
+    return float(((residuals_of(T, shuffled) < threshold) & before_both(T, shuffled)).mean())
+
+
+def _turned(x: FloatArray) -> FloatArray:
+    """First rays of matches (N, 4) under the rotation that best lays them on the second ones, as (N, 3), z = 1."""
+    from scipy.spatial.transform import Rotation
+
+    first, second = (np.column_stack([x[:, k : k + 2], np.ones(len(x))]) for k in (0, 2))
+    first, second = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (first, second))
+    weights = np.ones(len(x))
+    for _ in range(5):  # far points decide: those that the rotation alone explains
+        R, _ = Rotation.align_vectors(second, first, weights)
+        weights = 1 / (1e-4 + np.linalg.norm(R.apply(first) - second, axis=1))
+    moved = R.apply(first)
+    return np.asarray(moved / np.maximum(moved[:, 2:], 1e-9))
+
+
+def _of_a_plane(T: FloatArray, x: FloatArray, threshold: float) -> tuple[FloatArray, ...]:
+    """Poses other than T that the homography of inliers (N, 4) allows and that explain nearly all of them."""
+    cv2 = opencv()
+    first, second = (np.ascontiguousarray(x[:, k : k + 2]) for k in (0, 2))
+    H, _ = cv2.findHomography(first, second, cv2.RANSAC, threshold)
+    if H is None:
+        return ()
+    others = []
+    _, turns, steps, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    for R, t in zip(turns, steps, strict=True):
+        other = np.vstack([np.hstack([R, t / max(np.linalg.norm(t), 1e-12)]), [0, 0, 0, 1]])
+        fits = (residuals_of(other, x) < threshold) & before_both(other, x)
+        if rotation_deg(other @ np.linalg.inv(T)) > _OTHER_POSE_DEG and fits.mean() > _EXPLAINED:
+            others.append(other)
+    return tuple(others)
+
+
+def _failed(num: int, reason: str) -> PoseResult:
+    return PoseResult("failed", (reason,), None, None, np.zeros(num, dtype=bool), np.full(num, np.inf))

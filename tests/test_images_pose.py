@@ -1,0 +1,202 @@
+"""Pose and homography of two images: right on clean and on wrong matches, and not called sure where they cannot be."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from image_scenes import CAMERA, matches_of, texture
+
+from geomoe3d.cli.main import geomoe3d
+from geomoe3d.errors import CheckpointError, InputError, MissingFileError
+from geomoe3d.images.cameras import Camera, rotation_deg
+from geomoe3d.images.features import detect, match
+from geomoe3d.images.homography import corner_error, find_homography, map_points, weighted_dlt
+from geomoe3d.images.network import ImageNetwork
+from geomoe3d.images.pose import find_pose
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.build import build_network
+from geomoe3d.networks.pretrained import save_pretrained
+from geomoe3d.networks.weight_files import WeightCard
+
+pytest.importorskip("cv2")
+pytestmark = pytest.mark.usefixtures("one_thread")
+H = np.array([[0.9, -0.1, 40], [0.15, 1.0, -30], [1e-4, -5e-5, 1]])
+
+
+def angle_between(a, b):
+    return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
+@pytest.mark.parametrize("estimator", ["magsac", "ransac", "eight_point"])
+def test_the_pose_of_matches_with_wrong_ones_among_them(estimator):
+    pixels, true, T = matches_of(wrong=0 if estimator == "eight_point" else 200)
+    found = find_pose(pixels, (CAMERA, CAMERA), estimator=estimator, threshold=1.5)
+    assert found.status == "ok", found.reasons
+    assert rotation_deg(found.T @ np.linalg.inv(T)) < 0.5
+    assert angle_between(found.t, T[:3, 3]) < 1.5
+    assert (found.inliers == true).mean() > (0.85 if estimator == "eight_point" else 0.97)
+    assert found.residuals[true].max() < 3 < np.median(found.residuals[~true]) if (~true).any() else True
+
+
+def test_eight_point_on_clean_matches_is_exact_and_weights_decide():
+    pixels, true, T = matches_of(noise=0, wrong=50)
+    found = find_pose(pixels, (CAMERA, CAMERA), weights=true * 0.7, estimator="eight_point")
+    assert np.abs(found.T - T).max() < 1e-6
+    spoilt = find_pose(pixels, (CAMERA, CAMERA), estimator="eight_point")
+    assert spoilt.status != "ok"
+
+
+def test_a_camera_that_only_turned_or_hardly_moved_is_ambiguous_and_its_rotation_right():
+    for step in ((0.0, 0, 0), (1e-3, 0, 0)):
+        pixels, _, T = matches_of(step=step, turn=10)
+        found = find_pose(pixels, (CAMERA, CAMERA))
+        assert found.status == "ambiguous"
+        assert "only turned" in found.reasons[0]
+        assert rotation_deg(found.R @ T[:3, :3].T) < 1
+
+
+def test_a_planar_scene_is_ambiguous_and_the_other_pose_is_given():
+    pixels, _, T = matches_of(planar=True, noise=0.1)
+    found = find_pose(pixels, (CAMERA, CAMERA))
+    assert found.status == "ambiguous"
+    assert "plane" in found.reasons[0]
+    poses = [found.T, *found.alternatives]
+    assert min(rotation_deg(pose @ np.linalg.inv(T)) for pose in poses) < 1
+
+
+def test_unrelated_images_are_never_ok_and_few_matches_fail():
+    for seed in range(5):
+        pixels = matches_of(8, wrong=500, seed=seed)[0]
+        assert find_pose(pixels, (CAMERA, CAMERA)).status in ("low_confidence", "failed")
+    for few in (np.zeros((0, 4)), pixels[:7], np.full((50, 4), np.nan), np.zeros((50, 4))):
+        found = find_pose(few, (CAMERA, CAMERA))
+        assert found.status == "failed"
+        assert found.T is None
+        assert not found.inliers.any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"weights": np.ones(3)}, "weights"),
+        ({"threshold": 0.0}, "threshold"),
+        ({"estimator": "magic"}, "magic"),
+    ],
+)
+def test_bad_arguments_are_named(changes, words):
+    pixels, *_ = matches_of(50)
+    with pytest.raises(InputError, match=words):
+        find_pose(pixels, (CAMERA, CAMERA), **changes)
+    with pytest.raises(InputError, match=words):
+        find_homography(pixels, **changes)
+
+
+def test_distortion_is_undone():
+    camera = Camera(700, 690, 390, 310, (0.1, -0.05, 1e-3, 2e-3), (800, 600))
+    rays = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
+    r2 = (rays**2).sum(axis=1, keepdims=True)
+    xy = (rays[:, :1] * rays[:, 1:]) * [2e-3, 4e-3]
+    xy[:, 0] = 2e-3 * rays.prod(axis=1) + 2e-3 * (r2[:, 0] + 2 * rays[:, 0] ** 2)
+    xy[:, 1] = 1e-3 * (r2[:, 0] + 2 * rays[:, 1] ** 2) + 4e-3 * rays.prod(axis=1)
+    distorted = rays * (1 + 0.1 * r2 - 0.05 * r2**2) + xy
+    np.testing.assert_allclose(camera.normalise(distorted * [700, 690] + [390, 310]), rays, atol=1e-5)
+
+
+@pytest.mark.parametrize("estimator", ["dlt", "ransac", "magsac"])
+def test_the_homography_of_clean_matches(estimator):
+    first = np.random.default_rng(0).uniform([0, 0], [800, 600], (60, 2))
+    found = find_homography(np.hstack([first, map_points(H, first)]), estimator=estimator)
+    assert found.status == "ok"
+    np.testing.assert_allclose(found.H, H, atol=1e-6, rtol=1e-5)
+    assert corner_error(found.H, H, (800, 600)) < 1e-4
+    assert found.inliers.all()
+
+
+def test_dlt_is_differentiable_and_degenerate_matches_fail():
+    line = np.column_stack([np.arange(30.0), 2 * np.arange(30.0)] * 2)
+    for pixels in (line, np.zeros((30, 4)), line[:3]):
+        assert find_homography(pixels, estimator="dlt").status == "failed"
+        weights = torch.ones(len(pixels), requires_grad=True)
+        weighted_dlt(torch.from_numpy(pixels), weights)[0].sum().backward()
+        assert bool(weights.grad.isfinite().all())
+    assert corner_error(None, H, (8, 8)) == np.inf
+    shift = np.array([[1.0, 0, 3], [0, 1, 4], [0, 0, 1]])
+    assert corner_error(shift, np.eye(3), (8, 8)) == pytest.approx(5.0)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    import cv2
+
+    folder = tmp_path_factory.mktemp("pair")
+    image = texture()
+    cv2.imwrite(str(folder / "a.png"), image)
+    cv2.imwrite(str(folder / "b.png"), cv2.warpPerspective(image, H, (480, 360), borderValue=128))
+    return folder
+
+
+@pytest.mark.parametrize("detector", ["rootsift", "sift", "orb"])
+def test_keypoints_match_where_the_warp_puts_them(pair, detector):
+    found = match(*(detect(pair / name, detector, 500) for name in ("a.png", "b.png")))
+    best = found.distinct()
+    assert len(best) > 40
+    off = np.linalg.norm(map_points(H, best.pixels[:, :2]) - best.pixels[:, 2:], axis=1)
+    assert np.median(off) < 1.0
+    assert (found.ratio <= 1 + 1e-6).all()
+
+
+def test_reduced_images_give_keypoints_of_the_whole(pair):
+    import cv2
+
+    large = cv2.resize(texture(), None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+    whole, reduced = detect(texture(), most=200), detect(large, most=200, longer_side=480)
+    assert reduced.size == (1440, 1080)
+    both = match(whole, reduced).distinct().pixels
+    assert np.median(np.linalg.norm((both[:, :2] + 0.5) * 3 - 0.5 - both[:, 2:], axis=1)) < 1.0
+
+
+def test_an_image_without_structure_has_no_matches():
+    flat = detect(np.full((50, 60), 7, np.uint8))
+    assert len(match(flat, flat)) == 0
+    with pytest.raises(MissingFileError, match="nowhere"):
+        detect("nowhere.png")
+
+
+def run(*words):
+    return CliRunner().invoke(geomoe3d, [str(word) for word in words], standalone_mode=False)
+
+
+def test_homography_on_the_command_line(pair, tmp_path):
+    done = run("homography", pair / "a.png", pair / "b.png", "--output", tmp_path / "h.json", "--picture",
+               tmp_path / "h.png")  # fmt: skip
+    assert "status: ok" in done.output
+    answer = json.loads((tmp_path / "h.json").read_text())
+    assert corner_error(np.array(answer["H"]), H, (480, 360)) < 3
+    assert (tmp_path / "h.png").stat().st_size > 10_000
+
+
+def test_a_pose_with_guessed_intrinsics_is_not_ok_and_a_network_weighs(pair, tmp_path):
+    config = NetworkConfig(correspondence_dim=4, num_layers=1, width=16, num_sub_fields=4, num_heads=2)
+    weights = tmp_path / "w.safetensors"
+    save_pretrained(weights, build_network(config), WeightCard(architecture={}))
+    done = run("pose", pair / "a.png", pair / "b.png", "--weights", weights, "--output", tmp_path / "p.json",
+               "--picture", tmp_path / "p.png")  # fmt: skip
+    answer = json.loads((tmp_path / "p.json").read_text())
+    assert answer["status"] != "ok"
+    assert "guess" in answer["reasons"][-1] or answer["status"] == "failed"
+    assert done.return_value == 3
+    verdict = ImageNetwork(weights)(np.random.default_rng(0).normal(size=(40, 4)))
+    assert verdict.logits.shape == verdict.expert.shape == (40,)
+    save_pretrained(tmp_path / "c.safetensors", build_network(NetworkConfig(num_layers=1)), WeightCard({}))
+    with pytest.raises(CheckpointError, match="clouds"):
+        ImageNetwork(tmp_path / "c.safetensors")
+
+
+def test_intrinsics_that_are_none_are_named(pair):
+    done = run("pose", pair / "a.png", pair / "b.png", "--intrinsics", "700,700")
+    assert isinstance(done.exception, InputError)
+    assert "fx,fy,cx,cy" in str(done.exception)

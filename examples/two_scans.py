@@ -22,7 +22,7 @@ import numpy as np
 import geomoe3d
 from geomoe3d.data.sample import write_sample_pair
 
-paths = write_sample_pair("sample")
+paths = write_sample_pair("sample", force=True)
 result = geomoe3d.register(paths.source, paths.target)
 result  # noqa: B018  a notebook shows the status here, and the clouds to be turned
 

@@ -213,7 +213,7 @@ def register_correspondences(
     """
     if config is not None and config.scale != "fixed":
         raise ConfigError(
-            f"scale: {config.scale} needs the clouds; correspondences alone give a rigid motion"
+            f"scale: {config.scale} needs the clouds; correspondences alone give a rigid transform"
         )
     return CorrespondenceRegistrar(config)(correspondences, voxel_size=voxel_size)
 

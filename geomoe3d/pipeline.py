@@ -253,7 +253,7 @@ def resolved(config: RegistrationConfig | None) -> RegistrationConfig:
 def with_weights(config: RegistrationConfig, name_or_path: str) -> RegistrationConfig:
     """The configuration with trained weights in the place where they belong, as their card says.
 
-    A network that judges transforms becomes the scorer, one that weighs correspondences the outlier filter.
+    A network that scores transforms becomes the scorer, one that weighs correspondences the outlier filter.
 
     Raises:
         CheckpointError: no such weights.

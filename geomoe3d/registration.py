@@ -228,7 +228,7 @@ def register(
 def _check_guess_is_wanted(config: RegistrationConfig) -> None:
     if config.scale == "estimate":
         raise ConfigError(
-            "a first guess is a rigid motion and says nothing of the scale that is to be estimated (scale: "
+            "a first guess is a rigid transform and says nothing of the scale that is to be estimated (scale: "
             "estimate); leave one of the two out"
         )
     if not config.scoring.scorers:

@@ -203,7 +203,7 @@ def from_correspondences(matched: Correspondences, settings: tuple[str, ...]) ->
 
 
 def counts(given: argparse.Namespace) -> Iterator[Case]:
-    """Keypoints drawn in described fragments of the dev half."""
+    """Keypoints drawn in fragments with features of the dev half."""
 
     @lru_cache(maxsize=64)
     def described(path: Path) -> tuple[Any, Any]:

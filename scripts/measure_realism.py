@@ -35,7 +35,9 @@ _TOLERANCE = 0.2
 @click.command()
 @click.argument("generated", type=click.Path(exists=True))
 @click.option("--real", type=click.Path(exists=True), help="Default: the benchmark's dev half.")
-@click.option("--work", default="runs/realism", show_default=True, help="Where described fragments are kept.")
+@click.option(
+    "--work", default="runs/realism", show_default=True, help="Where fragments with features are kept."
+)
 @click.option("--out", type=click.Path(), help="Picture to write (PNG).")
 @click.option("--max-pairs", default=3000, show_default=True, help="Pairs measured per side.")
 def main(generated: str, real: str | None, work: str, out: str | None, max_pairs: int) -> None:

@@ -2,7 +2,7 @@
 
     python scripts/measure_verdicts.py WEIGHTS... [--every 4]
 
-WEIGHTS: names or .safetensors files of networks that judge motions; all are shown the same 20 motions that
+WEIGHTS: names or .safetensors files of networks that score transforms; all are shown the same 20 motions that
 consensus proposes for the fixed 1,000 correspondences of 3DMatch and 3DLoMatch (GEOMOE3D_DATA). Prints per
 network and benchmark: how often the motion that it likes best of the first 8 and of 20 is right, the AUROC of
 the best of the first 8 verdicts over pairs, the mean binary cross-entropy of all 20, and the F1 of the labels

@@ -6,7 +6,7 @@
 recall: all pairs of the dev half of 3DMatch and 3DLoMatch (GEOMOE3D_DATA), the fixed 1,000 correspondences,
 as published and with both clouds turned at random (seeded by the pair), motion by weighted SVD on the
 weights alone and, unless --no-consensus, by consensus with them. WEIGHTS: a .safetensors file of any network
-that judges no motions, or none or spectral. Writes OUT/recall.md, and OUT/recall.csv with a row per pair.
+that scores no transforms, or none or spectral. Writes OUT/recall.md, and OUT/recall.csv with a row per pair.
 Rows are compared with the first NAME pair by pair. --frame turns the clouds into a canonical frame before the
 networks see them, whatever they were trained with.
 

@@ -24,7 +24,7 @@ from geomoe3d.training.config import load_train_config
 from geomoe3d.training.logs import read_csv
 
 NOTES = (
-    "GeoMoE that judges motions; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
+    "GeoMoE that scores transforms; see MODEL_CARD.md beside it. Trained on generated rooms, walks "
     "through scene meshes (MIT-0) and one recorded lounge; never on 3DMatch or 3DLoMatch. docs/training.md "
     "tells of the run."
 )

@@ -1,4 +1,4 @@
-"""Train the learned descriptor on described fragments.
+"""Train the learned descriptor on fragments with features.
 
     python scripts/train_descriptor.py runs/descriptor [KEY=VALUE...]
 

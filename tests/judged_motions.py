@@ -1,4 +1,4 @@
-"""A small network that judges motions, and what it is given: channels, pairs to learn from, turns."""
+"""A small network that scores transforms, and what it is given: channels, pairs to learn from, turns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Channels of a network that judges motions: what the true one looks like, and what must not matter."""
+"""Channels of a network that scores transforms: what the true one looks like, and what must not matter."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_channels_need_their_own_form_of_network() -> None:
                    {"extra_channels": ("aligned", "ratio")}):  # fmt: skip
         with pytest.raises(ConfigError, match="aligned"):
             build_config(NetworkConfig, {**SMALL, **change})
-    with pytest.raises(InputError, match="judges motions"):
+    with pytest.raises(InputError, match="scores transforms"):
         pair_input(scene()[0], VOXEL, build_config(NetworkConfig, SMALL))
 
 

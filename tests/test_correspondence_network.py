@@ -65,6 +65,6 @@ def test_weights_are_asked_for_and_must_fit(tmp_path: Path) -> None:
     assert NetworkFilter.from_pretrained("pointcn", path)(
         Correspondences(ROWS), voxel_size=0.05
     ).weights.any()
-    with pytest.raises(CheckpointError, match=r"judges motions"):
+    with pytest.raises(CheckpointError, match=r"scores transforms"):
         NetworkFilter(tiny(motion_form="none", extra_channels=("aligned",), knn_space="source"))
     assert torch.get_num_threads() == 1

@@ -64,8 +64,8 @@ def test_empty_file_has_no_entries(tmp_path: Path) -> None:
         ("0 1 60\n1 0 0 0\n0 1 0 0\n0 0 1 x\n0 0 0 1\n", "line 1"),
         ("0 1 60\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n", "line 1"),
         ("0 1 60\n1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1: the entry 0 1 is not finite"),
-        ("0 1 60\n2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1: the entry 0 1 is no rigid motion"),
-        ("0 1 60\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "line 1: the entry 0 1 is no rigid motion"),
+        ("0 1 60\n2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1: the entry 0 1 is no rigid transform"),
+        ("0 1 60\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "line 1: the entry 0 1 is no rigid transform"),
         ("zero 1 60\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "line 1"),
     ],
 )

@@ -245,7 +245,7 @@ def test_a_rough_guess_alone_is_refined_and_chosen():
     [
         (np.eye(3), "shape"),
         (np.full((4, 4), np.nan), "finite"),
-        (2 * np.eye(4), "no rigid motion"),
+        (2 * np.eye(4), "no rigid transform"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrors"),
         (np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * [0.5, 0, 0, 0], "last row|no rigid"),
         ([["a"] * 4] * 4, "numbers"),

@@ -14,6 +14,7 @@ from geomoe3d.cli.main import geomoe3d
 from geomoe3d.clouds.io import save_points
 from geomoe3d.data.threedmatch import write_gt_log
 from geomoe3d.evaluation.benchmarks import NUM_UNRELATED
+from geomoe3d.evaluation.predict import MethodSpec, PredictReport
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 
 OWN = """
@@ -183,3 +184,21 @@ def test_nothing_to_score_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "holds no predictions" in capsys.readouterr().err
     assert evaluate("score", tmp_path, "--report", tmp_path / "r.pdf") == 2
     assert ".html" in capsys.readouterr().err
+
+
+def test_parts_are_named_as_where_pairs_are_registered(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[tuple[str, ...]] = []
+
+    def spy(study: str, specs: list[MethodSpec], *_: object, **__: object) -> PredictReport:
+        asked.extend(spec.assignments for spec in specs)
+        return PredictReport((), made=1, kept=0, absent={})
+
+    monkeypatch.setattr("geomoe3d.evaluation.predict.predict", spy)
+    words = ["--benchmark", str(folder), "--method", "geomoe3d"]
+    named = ["--filter", "spectral", "--scorer", "surfaces"]
+    assert evaluate("predict", tmp_path / "out", *words, "--set", "filter.name=none", *named) == 0
+    assert asked == [("filter.name=none", "filter.name=spectral", "scoring.scorers=[surfaces]")]
+    assert evaluate("predict", tmp_path / "out", *words, "--descriptor", "fpfj") == 2
+    assert "did you mean 'fpfh'" in capsys.readouterr().err

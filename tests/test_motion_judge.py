@@ -1,4 +1,4 @@
-"""A network that judges motions, and bare correspondences that it scores: the same folded, padded, threaded."""
+"""A network that scores transforms, and bare correspondences that it scores: the same folded, padded, threaded."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def test_normals_keep_their_length(tmp_path: Path) -> None:
     geomoe3d.save_points(tmp_path / "in.ply", points, normals=normals)
     save_aligned(tmp_path / "out.ply", tmp_path / "in.ply", SIMILAR, scale=FEET)
     np.testing.assert_allclose(read_raw(tmp_path / "out.ply").normals, normals @ R.T, atol=1e-6)
-    with pytest.raises(InputError, match="no rigid motion"):
+    with pytest.raises(InputError, match="no rigid transform"):
         save_aligned(tmp_path / "no.ply", points, SIMILAR)
     with pytest.raises(InputError, match=r"no similarity of scale 2"):
         save_aligned(tmp_path / "no.ply", points, SIMILAR, scale=2.0)

@@ -167,5 +167,5 @@ def test_pairs_without_a_motion_are_left_out(
     assert len(folder) == 75
     assert all(len(folder[i].motions) > 0 for i in range(75))  # type: ignore[arg-type]
     monkeypatch.setattr(motions_module, "propose", lambda *_, **__: [])
-    with pytest.raises(InputError, match=r"pairs 0 to 99 .* no motion for any"):
+    with pytest.raises(InputError, match=r"pairs 0 to 99 .* no transform for any"):
         propose_motions(shards, tmp_path / "none", 100)

@@ -71,7 +71,7 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
 
     Raises:
         InputError: no such file, no rows, a duplicate id, a row without source or target, or a first guess
-            that is no rigid motion; names the line.
+            that is no rigid transform; names the line.
         FormatError: no header with the two columns, a name that is nearly a known one, a row with more cells
             than the header, or no text.
     """

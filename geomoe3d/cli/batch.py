@@ -9,7 +9,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import configuration_options, scale_option, worker_options
+from geomoe3d.cli.parts import cache_options, configuration_options, scale_option, worker_options
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
@@ -32,8 +32,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 )
 @click.option("--fresh", is_flag=True, help="Delete the results of an earlier batch in OUT first.")
 @click.option("--retry", is_flag=True, help="Try the pairs again that could not be registered.")
-@click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
-@click.option("--no-cache", is_flag=True, help="Cache no features: compute them anew for every pair.")
+@cache_options
 @click.option("--quiet", is_flag=True, help="No progress and no table.")
 @part_option("reader")
 @traceback_option
@@ -51,7 +50,6 @@ def command(
     fresh: bool,
     retry: bool,
     cache: str | None,
-    no_cache: bool,
     quiet: bool,
 ) -> None:
     """Register every pair listed in PAIRS.csv and write the results to the folder OUT.
@@ -76,7 +74,7 @@ def command(
             pages=pages,
             fresh=fresh,
             retry=retry,
-            cache="" if no_cache else cache,
+            cache=cache,
             progress=False if quiet else None,
             say=lambda text: None if quiet else click.echo(text, err=True),
         )

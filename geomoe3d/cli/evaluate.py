@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geomoe3d.cli.errors import BAD_INPUT, HELP, command_line, traceback_option
+from geomoe3d.cli.parts import method_part_options
 
 if TYPE_CHECKING:
     from geomoe3d.evaluation.score import ScoredRun
@@ -49,10 +50,13 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 show_default=True,
                 help="Input: 1k or all (fixed correspondences), or clouds (end to end).",
             ),
-            click.option("--every", default=1, show_default=True, help="Use every n-th pair only."),
+            click.option(
+                "--every", metavar="N", default=1, show_default=True, help="Use every n-th pair only."
+            ),
             click.option(
                 "--unrelated",
                 "num_unrelated",
+                metavar="N",
                 default=200,
                 show_default=True,
                 help="Number of pairs of the benchmark unrelated.",
@@ -64,17 +68,23 @@ def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 multiple=True,
                 help="Configuration of geomoe3d and of networks with weights of yours; repeatable.",
             ),
-            click.option("--label", help="Name of the run, if there is one method. [the method's]"),
+            method_part_options,
+            click.option(
+                "--label", metavar="NAME", help="Name of the run, if there is one method. [the method's]"
+            ),
             click.option(
                 "--data", "root", metavar="FOLDER", help="Folder of the benchmarks. [GEOMOE3D_DATA]"
             ),
             click.option(
                 "--workers",
+                metavar="N",
                 default=1,
                 show_default=True,
                 help="Processes; with two or more, a method that crashes loses one pair only.",
             ),
-            click.option("--seed", default=0, show_default=True, help="Random seed of the methods."),
+            click.option(
+                "--seed", metavar="N", default=0, show_default=True, help="Random seed of the methods."
+            ),
             click.option("--fresh", is_flag=True, help="Remove the stored answers of these runs first."),
         )
     ):
@@ -198,7 +208,7 @@ def _predict(
         raise InputError(f"--label names one run, but {len(methods)} methods are given; give one method")
     if assignments and not CONFIGURABLE & set(methods):
         takers = ", ".join(sorted(CONFIGURABLE))
-        raise InputError(f"--set is for {takers}, which are not among those given")
+        raise InputError(f"--set, --filter and the like are for {takers}, which are not among those given")
     specs = [MethodSpec(name, assignments if name in CONFIGURABLE else (), label) for name in methods]
     sets = [EvaluationSet(benchmark, track, root, every, num_unrelated, seed) for benchmark in benchmarks]
     for one in sets[1:]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _KEPT_EVERY = 60.0  # seconds after which what was read so far is written
 
 
-@click.command(context_settings=HELP, short_help="Describe a large cloud once, to find scans in it.")
+@click.command(context_settings=HELP, short_help="Index a large cloud once, to find scans in it.")
 @click.argument("inputs", metavar="CLOUDS... OUT.map", nargs=-1, required=True)
 @click.option(
     "--poses",
@@ -33,7 +33,7 @@ _KEPT_EVERY = 60.0  # seconds after which what was read so far is written
 def command(
     inputs: tuple[str, ...], poses: str | None, config: RegistrationConfig, fresh: bool, quiet: bool
 ) -> None:
-    """Describe CLOUDS (files, or folders of them), one map together, in the file OUT.map.
+    """Index CLOUDS (files, or folders of them), one map together, in the file OUT.map.
 
     `geomoe3d locate` finds scans in it. Called again with more clouds, or after an interruption, it reads only those
     that are not in it yet. LAS and LAZ are read in pieces. With --poses the clouds are taken for scans, whose sensors

@@ -24,12 +24,18 @@ if TYPE_CHECKING:
 @click.argument("inputs", metavar="SCANS... MAP", nargs=-1, required=True)
 @configuration_options
 @click.option(
-    "-k", "--places", type=click.IntRange(1), default=3, show_default=True, help="Places named at most."
+    "-k",
+    "--places",
+    metavar="N",
+    type=click.IntRange(1),
+    default=3,
+    show_default=True,
+    help="Places named at most.",
 )
 @click.option("--near", metavar="X,Y,Z", help="Where the sensor is believed to be, in the map's coordinates.")
 @click.option("--within", type=float, metavar="LENGTH", help="How far off that may be.")
 @click.option(
-    "--initial", metavar="FILE", help="A first guess of the motion, as of `register`; one scan only."
+    "--initial", metavar="FILE", help="A first guess of the transform, as of `register`; one scan only."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per scan and nothing else.")
 @click.option(
@@ -55,7 +61,7 @@ def command(
 ) -> None:
     """Find SCANS (files, or folders of them) in MAP: p_map = R p_scan + t.
 
-    MAP is what `geomoe3d index` wrote, or a cloud, which is then described first. Exit code 0 if all are ok, 3 if
+    MAP is what `geomoe3d index` wrote, or a cloud, which is then indexed first. Exit code 0 if all are ok, 3 if
     not, 2 for unusable input. A place that is given by --near is looked at first and checked, not trusted.
     """
     if len(inputs) < 2:

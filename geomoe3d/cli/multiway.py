@@ -9,7 +9,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import configuration_options, worker_options
+from geomoe3d.cli.parts import cache_options, configuration_options, worker_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 
 if TYPE_CHECKING:
@@ -60,13 +60,13 @@ _SHOWN = 20
     nargs=2,
     type=float,
     metavar="LENGTH DEGREES",
-    help="Standard deviation of the motion between two scans by these poses. [2 voxels, 2 degrees]",
+    help="Standard deviation of the transform between two scans by these poses. [2 voxels, 2 degrees]",
 )
 @click.option("--second-look", is_flag=True, help="Look twice at doubtful pairs: three times as slow.")
 @click.option("--e57", is_flag=True, help="Write OUT/groupN.e57 too: every point, each scan with its pose.")
 @click.option("--page/--no-page", default=True, help="Write OUT/page.html, or do not. [--page]")
 @click.option("--fresh", is_flag=True, help="Delete the earlier model in OUT first.")
-@click.option("--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]")
+@cache_options
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @part_option("reader")
 @traceback_option

@@ -11,7 +11,7 @@ import click
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 _PARTS = (
-    ("descriptor", "descriptor.name", "What describes the surface at each point. [fpfh]"),
+    ("descriptor", "descriptor.name", "Features of each point: fpfh, multiscale or learned. [fpfh]"),
     ("matcher", "matching.name", "one_way, mutual or ratio. [one_way]"),
     ("filter", "filter.name", "Outlier rejection: none, spectral, or a network. [none]"),
     ("estimator", "estimator.name", "consensus, ransac or svd. [consensus]"),
@@ -50,29 +50,41 @@ def scale_option(command: Command) -> Command:
     return result
 
 
-def configuration_options(command: Command) -> Command:
-    """Adds the options; the command gets what they come to as ``config``, a `RegistrationConfig`.
+def cache_options(command: Command) -> Command:
+    """Adds ``--cache`` and ``--no-cache``; the command gets ``cache``, empty for none."""
 
-    An option overrides ``--set``, which overrides the file. A part is a name or a class of the user's own,
-    ``file.py:Class`` or ``module:Class``.
+    @wraps(command)
+    def with_cache(*args: Any, **named: Any) -> Any:
+        if named.pop("no_cache"):
+            named["cache"] = ""
+        return command(*args, **named)
+
+    none: Any = click.option("--no-cache", is_flag=True, help="Cache no features: compute them anew.")(
+        with_cache
+    )
+    result: Command = click.option(
+        "--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]"
+    )(none)
+    return result
+
+
+def method_part_options(command: Command) -> Command:
+    """Adds ``--descriptor`` and its like; the command finds what they come to at the end of its ``assignments``.
+
+    A part is a name or a class of the user's own, ``file.py:Class`` or ``module:Class``.
     """
 
     @wraps(command)
-    def with_config(*args: Any, **named: Any) -> Any:
-        from geomoe3d.config import load_config
-
+    def with_parts(*args: Any, **named: Any) -> Any:
         given = [(option, key, named.pop(f"part_{option}")) for option, key, _ in _PARTS]
         given = [(option, key, value) for option, key, value in given if value is not None]
         scorers = named.pop("part_scorers")
         _check([(option, value) for option, _, value in given] + [("scorer", name) for name in scorers])
-        settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
-        settings.append(("scale", "estimate" if named.pop("estimate_scale", False) else None))
-        settings += [(key, value) for _, key, value in given]
-        chosen = [f"{key}={value}" for key, value in settings if value is not None]
+        chosen = [f"{key}={value}" for _, key, value in given]
         if scorers:
             chosen.append(f"scoring.scorers=[{', '.join(scorers)}]")
-        file, assignments = named.pop("config_file"), named.pop("assignments")
-        return command(*args, **named, config=load_config(file, [*assignments, *chosen]))
+        named["assignments"] = (*named["assignments"], *chosen)
+        return command(*args, **named)
 
     wrapped: Any = click.option(
         "--scorer",
@@ -80,16 +92,36 @@ def configuration_options(command: Command) -> Command:
         metavar="NAME",
         multiple=True,
         help="What scores the hypotheses: surfaces, network, or your own; repeatable. [surfaces, network]",
-    )(with_config)
+    )(with_parts)
     for option, _, text in reversed(_PARTS):
         wrapped = click.option(f"--{option}", f"part_{option}", metavar="NAME", help=text)(wrapped)
-    wrapped = click.option(
+    result: Command = wrapped
+    return result
+
+
+def configuration_options(command: Command) -> Command:
+    """Adds the options; the command gets what they come to as ``config``, a `RegistrationConfig`.
+
+    An option overrides ``--set``, which overrides the file.
+    """
+
+    @wraps(command)
+    def with_config(*args: Any, **named: Any) -> Any:
+        from geomoe3d.config import load_config
+
+        settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
+        settings.append(("scale", "estimate" if named.pop("estimate_scale", False) else None))
+        chosen = [f"{key}={value}" for key, value in settings if value is not None]
+        file, assignments = named.pop("config_file"), named.pop("assignments")
+        return command(*args, **named, config=load_config(file, [*assignments, *chosen]))
+
+    wrapped: Any = click.option(
         "--set",
         "assignments",
         metavar="KEY=VALUE",
         multiple=True,
         help="One value of the configuration; repeatable.",
-    )(wrapped)
+    )(method_part_options(with_config))
     for option, name, metavar, text in reversed(_SETTINGS):
         wrapped = click.option(option, name, metavar=metavar, help=text)(wrapped)
     result: Command = wrapped

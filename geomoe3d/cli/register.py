@@ -34,7 +34,7 @@ class _Outputs:
     unit: str
 
 
-@click.command(context_settings=HELP, short_help="Lay one scan on another, and say how sure.")
+@click.command(context_settings=HELP, short_help="Register one scan to another, and say how sure.")
 @click.argument("source", metavar="SOURCE")
 @click.argument("target", metavar="TARGET")
 @configuration_options
@@ -42,7 +42,7 @@ class _Outputs:
 @click.option("--weights", metavar="FILE", help="Trained network (.safetensors): scorer or filter, as it is.")
 @click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
-@click.option("--inverse", is_flag=True, help="Give the motion that maps TARGET into SOURCE instead.")
+@click.option("--inverse", is_flag=True, help="Give the transform that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
 @click.option(
     "--output",
@@ -102,12 +102,12 @@ def command(
     force: bool,
     quiet: bool,
 ) -> None:
-    """Find the rigid motion that lays SOURCE on TARGET: p_target = R p_source + t.
+    """Find the rigid transform that registers SOURCE to TARGET: p_target = R p_source + t.
 
     With --estimate-scale a similarity: p_target = scale R p_source + t.
 
     SOURCE and TARGET are point clouds or meshes (PLY, PCD, XYZ, NPY, OBJ, STL, LAS, E57, ...). No first
-    guess is needed. The motion is given in the files' own coordinates, with a status: ok,
+    guess is needed. The transform is given in the files' own coordinates, with a status: ok,
     low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
     """
 

@@ -10,7 +10,12 @@ from geomoe3d.cli.errors import HELP, traceback_option
 @click.command(context_settings=HELP)
 @click.argument("folder", default="sample", metavar="[FOLDER]")
 @click.option(
-    "--seed", type=int, default=0, show_default=True, help="Random seed; another seed gives another pair."
+    "--seed",
+    metavar="N",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Random seed; another seed gives another pair.",
 )
 @click.option("--force", is_flag=True, help="Replace files that exist.")
 @traceback_option

@@ -2,7 +2,7 @@
 
 Correspondences bring points, often nothing else. Those of one scan still trace its surfaces, at the spacing
 of the keypoints, and that is enough to ask in which plane a point lies and what must be empty. Place: used
-by estimation and by the network that judges motions; about 3 ms for 1,000 points.
+by estimation and by the network that scores transforms; about 3 ms for 1,000 points.
 """
 
 from __future__ import annotations

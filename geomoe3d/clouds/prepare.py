@@ -121,7 +121,7 @@ def check_cloud(cloud: PointCloud) -> None:
     """
     if len(cloud) < _MIN_POINTS:
         raise EmptyCloudError(
-            f"'{cloud.name}' holds {len(cloud)} points; a rigid motion needs at least {_MIN_POINTS}"
+            f"'{cloud.name}' holds {len(cloud)} points; a rigid transform needs at least {_MIN_POINTS}"
         )
     if not extents(cloud.points).any():
         raise EmptyCloudError(
@@ -163,7 +163,7 @@ def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
     return (
         f"the extents differ by a factor of {large / small:.0f} ('{source.name}' {extents[0]:.4g}, "
         f"'{target.name}' {extents[1]:.4g}; at most {_MAX_EXTENT_RATIO} is taken): one is probably in "
-        "millimetres and the other in metres; bring both to one unit, a rigid motion cannot change scale"
+        "millimetres and the other in metres; bring both to one unit, a rigid transform cannot change scale"
     )
 
 

@@ -203,7 +203,7 @@ def save_aligned(
         Names of what the source says of its points and the written file does not.
 
     Raises:
-        InputError: no rigid motion, or a source that cannot be used (as `load_points`).
+        InputError: no rigid transform, or a source that cannot be used (as `load_points`).
         FormatError: as `check_aligned`.
         OutputError: as `check_cloud_output`, or the disk refuses.
     """
@@ -331,7 +331,7 @@ def _checked_motion(T: ArrayLike, scale: float) -> FloatArray:
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     bottom = np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max()
     if error > 1e-4 or bottom > 1e-9 or np.linalg.det(R) < 0:
-        what = "rigid motion" if scale == 1.0 else f"similarity of scale {scale:.6g}"
+        what = "rigid transform" if scale == 1.0 else f"similarity of scale {scale:.6g}"
         raise InputError(
             f"T_target_source is no {what}: |R R^T - I| is {error:.3g} (limit 1e-4), the determinant "
             f"{np.linalg.det(R):.3g} (expected 1), the last row {matrix[3].tolist()}"

@@ -141,7 +141,7 @@ def _of_rows(rows: list[list[float]], remarks: str) -> FloatArray:
         found = dict(zip(names, rows[0][-7:], strict=True))
         return _of_seven([found[name] for name in _SEVEN])
     if shape[0] > 1 and shape[1] in (7, 8, 12):
-        raise FormatError(f"{shape[0]} rows of {shape[1]} numbers; give a file of one motion")
+        raise FormatError(f"{shape[0]} rows of {shape[1]} numbers; give a file of one transform")
     what = f"numbers of shape {shape}" if shape[1] else f"{len(rows)} rows of {sum(map(len, rows))} numbers"
     raise FormatError(f"{what}; expected (4, 4), (3, 4), or translation and quaternion")
 

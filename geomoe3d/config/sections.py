@@ -125,8 +125,8 @@ class SecondLookConfig(Section):
 
     descriptor: str = Field(
         "learned",
-        description="describes an answer's clouds once more where it is not ok: its matches join the others, its "
-        "features score; a name as descriptor.name, with its defaults. none, or the same as that: no",
+        description="features of an answer's clouds are computed once more where it is not ok: its matches join the "
+        "others, its features score; a name as descriptor.name, with its defaults. none, or the same as that: no",
     )
     min_confidence: float = Field(
         0.98,

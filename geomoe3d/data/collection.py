@@ -304,7 +304,7 @@ def _open_predator(collection: Collection) -> None:
                     f"lists of unequal length: {len(names)}, {len(R)}, {len(t)}, {len(overlaps)}"
                 )
             if not all(np.isfinite(values).all() for values in (R, t, overlaps)):
-                raise FormatError("a motion or an overlap is not finite")
+                raise FormatError("a transform or an overlap is not finite")
         except (GeoMoE3DError, KeyError, TypeError, ValueError) as error:
             collection.problems.append(f"'{file}' is no list of pairs: {error}")
             continue

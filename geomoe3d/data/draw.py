@@ -1,4 +1,4 @@
-"""Pairs drawn fresh from described fragments: new keypoints, new matches, every time.
+"""Pairs drawn fresh from fragments with features: new keypoints, new matches, every time.
 
 Index k of a pool always gives the same pair of the same keypoints, and there is no end of indices, so no
 epoch repeats the matches of another. `geomoe3d.training.fragment_pairs` makes them a training data set.

@@ -91,7 +91,10 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
     save_transform(
         paths.truth,
         T_target_source,
-        ["the true motion of the sample pair", "maps source.ply into target.ply: p_target = R p_source + t"],
+        [
+            "the true transform of the sample pair",
+            "maps source.ply into target.ply: p_target = R p_source + t",
+        ],
         force=force,
     )
     return paths

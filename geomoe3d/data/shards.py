@@ -106,7 +106,7 @@ def write_shard(folder: str | Path, scene: DescribedScene, settings: dict[str, A
 
 
 def is_shard(folder: Path) -> bool:
-    """Whether a folder is a shard of described fragments."""
+    """Whether a folder is a shard of fragments with features."""
     return (folder / _META).is_file()
 
 
@@ -199,7 +199,7 @@ def shard_folders(folder: str | Path) -> list[Path]:
     found = sorted(p for p in folder.iterdir() if not p.name.startswith(".") and is_shard(p))
     if not found:
         raise InputError(
-            f"'{folder}' holds no shard of described fragments; 'geomoe3d data features' makes them"
+            f"'{folder}' holds no shard of fragments with features; 'geomoe3d data features' makes them"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""What described fragments look like in numbers, so that generated ones can be held against real ones.
+"""What fragments with features look like in numbers, so that generated ones can be held against real ones.
 
 Every quantity is measured by the same code on both sides: points and large planes per fragment, spacing,
 overlap, and per pair the share of true matches of 1,000 keypoints and their residuals. About 30 ms per
@@ -46,7 +46,7 @@ class Statistics:
 
 
 def measure(folder: str | Path, *, max_pairs: int = 3000) -> Statistics:
-    """Statistics of a folder of described fragments, the same at every call.
+    """Statistics of a folder of fragments with features, the same at every call.
 
     Args:
         folder: of shards.

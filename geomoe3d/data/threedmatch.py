@@ -118,7 +118,7 @@ def read_gt_log(path: str | Path) -> PairTable:
 
     Raises:
         InputError: the file cannot be read.
-        FormatError: an entry is cut short, holds no finite numbers or is no rigid motion; names the line.
+        FormatError: an entry is cut short, holds no finite numbers or is no rigid transform; names the line.
     """
     return _read_blocks(Path(path), 4)
 
@@ -314,6 +314,6 @@ def _read_blocks(path: Path, size: int) -> PairTable:
         if not np.isfinite(matrix).all():
             raise FormatError(f"'{path}' line {number}: the entry {i} {j} is not finite")
         if size == 4 and not is_motion(matrix, _MAX_SKEW):
-            raise FormatError(f"'{path}' line {number}: the entry {i} {j} is no rigid motion")
+            raise FormatError(f"'{path}' line {number}: the entry {i} {j} is no rigid transform")
         entries.append((i, j, matrix))
     return entries

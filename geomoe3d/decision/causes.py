@@ -39,7 +39,7 @@ def differing_units(
     names = f"'{source.name}'", f"'{target.name}'"  # not roles, which may be exchanged here
     return (
         f"units differ: with all lengths of '{source.name}' divided by {ratio:.6g} the clouds fit"
-        f"{seeming_units(ratio, names)}; bring both to one unit, a rigid motion cannot change scale"
+        f"{seeming_units(ratio, names)}; bring both to one unit, a rigid transform cannot change scale"
     )
 
 
@@ -75,6 +75,6 @@ def mirrored_axes(
         return None
     return (
         f"mirrored: with x of '{name}' the other way round the clouds fit (confidence "
-        f"{found.judgement.confidence:.2f}); a rigid motion cannot mirror, so bring both to right-handed axes (often "
-        "two axes are exchanged)"
+        f"{found.judgement.confidence:.2f}); a rigid transform cannot mirror, so bring both to right-handed axes "
+        "(often two axes are exchanged)"
     )

@@ -52,7 +52,7 @@ class Scale:
         """What a user is told where it `differs`."""
         text = (
             f"{DIFFERS}: lengths of the source are {self.ratio:.4g} times those of the target "
-            f"(+- {100 * self.sigma:.1f} %), and a rigid motion cannot change scale"
+            f"(+- {100 * self.sigma:.1f} %), and a rigid transform cannot change scale"
         )
         return text + seeming_units(self.ratio)
 

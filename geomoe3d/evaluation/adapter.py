@@ -82,7 +82,7 @@ class AdaptedFunction:
         """Call the function on copies of the pair's arrays and check what it returns.
 
         Raises:
-            InputError: the function raised, or returned something that is no rigid motion.
+            InputError: the function raised, or returned something that is no rigid transform.
         """
         if given.correspondences is not None:
             source, target = given.correspondences[:, :3].copy(), given.correspondences[:, 3:].copy()

@@ -2,7 +2,7 @@
 
 Weights are loaded once and folded for inference; calls share nothing and draw nothing at random. Rows with
 a NaN or infinite coordinate get weight 0. Cost: linear in N, about 30 ms at N = 1000 on two idle cores
-beside the inputs that the network asks for. A network that judges transforms is a scorer
+beside the inputs that the network asks for. A network that scores transforms is a scorer
 (`geomoe3d.scoring.network`), no filter.
 """
 
@@ -34,11 +34,11 @@ class GeoMoEFilter(OutlierFilter):
     """A network as outlier filter.
 
     Args:
-        model: trained, not one that judges transforms; its weights are copied.
+        model: trained, not one that scores transforms; its weights are copied.
         card: what it is, or None.
 
     Raises:
-        CheckpointError: a network that judges transforms.
+        CheckpointError: a network that scores transforms.
     """
 
     takes_weights: ClassVar[bool] = True
@@ -48,7 +48,7 @@ class GeoMoEFilter(OutlierFilter):
 
         if model.config.judges_motions:
             raise CheckpointError(
-                "this network judges transforms, it is no filter; give its weights as scoring.weights"
+                "this network scores transforms, it is no filter; give its weights as scoring.weights"
             )
         self.config = model.config
         self.card = card

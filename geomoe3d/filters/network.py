@@ -25,11 +25,11 @@ class NetworkFilter(OutlierFilter):
     """Any trained network that weighs correspondences; see `geomoe3d.networks.plain`.
 
     Args:
-        model: trained, not one that judges transforms.
+        model: trained, not one that scores transforms.
         card: what it is, or None.
 
     Raises:
-        CheckpointError: a network that judges transforms.
+        CheckpointError: a network that scores transforms.
     """
 
     takes_weights: ClassVar[bool] = True

@@ -120,19 +120,21 @@ def check_motion(T: ArrayLike) -> FloatArray:
     try:
         matrix = np.array(T, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError("a motion must be a matrix of numbers of shape (4, 4)") from None
+        raise InputError("a transform must be a matrix of numbers of shape (4, 4)") from None
     if matrix.shape != (4, 4):
-        raise InputError(f"a motion must be 16 finite numbers of shape (4, 4), found shape {matrix.shape}")
+        raise InputError(f"a transform must be 16 finite numbers of shape (4, 4), found shape {matrix.shape}")
     if not np.isfinite(matrix).all():
-        raise InputError("a motion must be 16 finite numbers of shape (4, 4), found NaN or infinities in it")
+        raise InputError(
+            "a transform must be 16 finite numbers of shape (4, 4), found NaN or infinities in it"
+        )
     R = matrix[:3, :3]
     if not is_rotation(R, _MOTION_TOLERANCE):
         off = _off_rotation(R)
         what = "mirrors" if off <= _MOTION_TOLERANCE else f"is {off:.3g} off a rotation"
         raise InputError(
-            f"the matrix is no rigid motion: its linear part {what} (at most {_MOTION_TOLERANCE}); scale and "
+            f"the matrix is no rigid transform: its linear part {what} (at most {_MOTION_TOLERANCE}); scale and "
             "shear are not estimated"
         )
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
-        raise InputError(f"the last row of a motion must be 0 0 0 1, found {matrix[3].tolist()}")
+        raise InputError(f"the last row of a transform must be 0 0 0 1, found {matrix[3].tolist()}")
     return make_transform(project_to_so3(R), matrix[:3, 3])

@@ -150,7 +150,7 @@ class Map:
             progress: as of `from_cloud`.
 
         Raises:
-            InputError: a cloud that cannot be read or has no usable points, or no rigid motion.
+            InputError: a cloud that cannot be read or has no usable points, or no rigid transform.
         """
         tell = progress or (lambda stage: None)
         tell("load")
@@ -232,7 +232,7 @@ class Map:
             progress: called with the name of each stage as it begins.
 
         Raises:
-            InputError: a scan that cannot be read or has too few usable points, a guess that is no rigid motion, or
+            InputError: a scan that cannot be read or has too few usable points, a guess that is no rigid transform, or
                 one of ``near`` and ``within`` without the other.
         """
         if not len(self._voxels):

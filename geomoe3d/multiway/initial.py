@@ -44,7 +44,7 @@ def read_poses(path: str | os.PathLike[str], names: Sequence[str]) -> tuple[Floa
     the scan, or the poses.json of a model with one group.
 
     Raises:
-        InputError: no such file, none of these, another number of poses than scans, or no rigid motion.
+        InputError: no such file, none of these, another number of poses than scans, or no rigid transform.
     """
     path = Path(path)
     try:

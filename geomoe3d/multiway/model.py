@@ -129,7 +129,7 @@ class SceneModel:
         scans: all that were given, in order.
         groups: scans that hang together, two or more each, the largest first; never forced into one.
         unplaced: name -> why the scan is in no group.
-        edges: all pairs that gave a motion.
+        edges: all pairs that gave a transform.
         num_pairs: pairs registered so far.
         seconds: wall time of this call by stage.
     """

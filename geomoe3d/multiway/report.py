@@ -101,7 +101,7 @@ def _why_unplaced(survey: Survey, edges: Sequence[Edge], scan: int) -> str:
     mine = [edge for edge in edges if scan in (edge.source, edge.target)]
     tried = sum(scan in pair for pair in survey.outcomes)
     if not mine:
-        return f"none of its {tried} pairs gave a motion"
+        return f"none of its {tried} pairs gave a transform"
     edge = max(mine, key=lambda edge: edge.confidence)
     other = survey.scans[edge.source if edge.target == scan else edge.target].name
     surest = f"its surest of {tried} pairs, with '{other}', has confidence {edge.confidence:.3f}"

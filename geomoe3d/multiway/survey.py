@@ -74,7 +74,7 @@ class Survey:
         similarity: (K, K) cosine of the descriptions of the scans as wholes; -inf where one is unusable, and
             between a scan and itself.
         outcomes: what became of every pair asked for so far, with motions in file coordinates.
-        edges: those of them that gave a motion, with motions (4, 4) in local coordinates.
+        edges: those of them that gave a transform, with motions (4, 4) in local coordinates.
         map_edges: edges between scans that local maps about them gave, by the pair's id.
         free_space: tells what the sensors saw through.
     """

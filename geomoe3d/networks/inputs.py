@@ -101,7 +101,7 @@ def pair_input(
         voxels = torch.cat([voxels[:, :3] @ A.T.float(), voxels[:, 3:] @ B.T.float()], dim=1)
     coordinates = voxels / config.unit_voxels
     if config.judges_motions:
-        raise InputError("this network judges motions; prepare it with MotionInputs, which is given some")
+        raise InputError("this network scores transforms; prepare it with MotionInputs, which is given some")
     given = {"feature_distance": feature_distance, "ratio": ratio, "mutual": mutual}
     compatibility = compatibility_inputs(voxels, config) if config.needs_compatibility else None
     channels: list[Tensor] = []

@@ -1,4 +1,4 @@
-"""From correspondences to what a network that judges motions sees of them; numpy alone.
+"""From correspondences to what a network that scores transforms sees of them; numpy alone.
 
 See `geomoe3d.networks.inputs` for networks that weigh correspondences.
 """
@@ -21,7 +21,7 @@ MIN_CORRESPONDENCES = 3
 
 
 class MotionInputs:
-    """Prepares one pair for a network that judges motions; build once per pair, then ask for any motions.
+    """Prepares one pair for a network that scores transforms; build once per pair, then ask for any motions.
 
     Args:
         correspondences: (N, 6) float, N >= 3, any unit.

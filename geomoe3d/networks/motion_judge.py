@@ -42,20 +42,20 @@ class Judged:
 
 
 class MotionJudge:
-    """A network that judges motions.
+    """A network that scores transforms.
 
     Args:
         network: trained with the channels ``aligned``.
         card: what it is, or None.
 
     Raises:
-        CheckpointError: a network that judges no motions.
+        CheckpointError: a network that scores no transforms.
     """
 
     def __init__(self, network: FoldedGeoMoE, card: WeightCard | None = None) -> None:
         if not network.config.judges_motions:
             raise CheckpointError(
-                "this network judges no transforms, it is an outlier filter: give its weights as filter.weights"
+                "this network scores no transforms, it is an outlier filter: give its weights as filter.weights"
             )
         self.config = network.config
         self.card = card

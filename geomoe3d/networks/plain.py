@@ -28,12 +28,12 @@ class PlainNetwork:
     published: a row within r = 2 voxels under the best motion weighs 1 / (1 + (d / r)^2), any other nothing.
 
     Args:
-        model: trained, not one that judges motions.
+        model: trained, not one that scores transforms.
     """
 
     def __init__(self, model: Network) -> None:
         if model.config.judges_motions:
-            raise CheckpointError("this network judges motions; it scores transforms, see scoring.weights")
+            raise CheckpointError("this network scores transforms, see scoring.weights")
         self.config = model.config
         self._network = model.eval()
 

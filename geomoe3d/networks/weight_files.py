@@ -74,7 +74,7 @@ def packaged_names() -> list[str]:
 
 
 def judges_transforms(name_or_path: str | Path) -> bool:
-    """Whether weights are of a network that judges transforms, by their card; False where there is no card.
+    """Whether weights are of a network that scores transforms, by their card; False where there is no card.
 
     Raises:
         CheckpointError: no such weights.

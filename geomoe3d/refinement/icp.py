@@ -25,7 +25,7 @@ _MARGIN_VOXELS = (
     2.5  # beyond the reach: points may come nearer in the course, and normals need their neighbours
 )
 _NORMAL_NEIGHBORS = 20
-_UNREFINED = "the unrefined motion is given"
+_UNREFINED = "the unrefined transform is given"
 
 
 @refiner("icp", "gicp")

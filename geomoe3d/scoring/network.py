@@ -1,6 +1,6 @@
 """What a trained network says of hypotheses, from the correspondences under each of them.
 
-The network that ships with the package judges transforms: it sees the correspondences as they lie under one and
+The network that ships with the package scores transforms: it sees the correspondences as they lie under one and
 gives a logit that it is right (`geomoe3d.networks.motion_judge`).
 """
 
@@ -66,7 +66,7 @@ def opinion_of(hypothesis: Hypothesis | None) -> Opinion | None:
 
 @scorer(NETWORK)
 class NetworkScorer(Scorer):
-    """A network that judges transforms as scorer; loaded when it is first needed.
+    """A network that scores transforms as scorer; loaded when it is first needed.
 
     Args:
         weights: a .safetensors file with its card, or the name of weights that ship with the package.

@@ -85,7 +85,7 @@ class Batch:
 def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
     """The dataset that a configuration names: ``synthetic`` or a folder of shards, of either kind.
 
-    Shards of described fragments (``geomoe3d data features``) give fresh correspondences without end, shards
+    Shards of fragments with features (``geomoe3d data features``) give fresh correspondences without end, shards
     of correspondences (`write_shard`) those that they hold.
     """
     if where == "synthetic":
@@ -164,9 +164,9 @@ def choose_motions(
     """
     if pair.motions is None or len(pair.motions) == 0:
         raise InputError(
-            "consensus proposed no motion to judge; leave such pairs out"
+            "consensus proposed no transform to score; leave such pairs out"
             if pair.motions is not None
-            else "no motions to judge; make the data with 'geomoe3d data motions'"
+            else "no transforms to score; make the data with 'geomoe3d data motions'"
         )
     T = pair.T_target_source
     right = np.array(

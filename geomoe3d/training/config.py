@@ -32,7 +32,7 @@ class DataConfig(Section):
     validation: str = Field("synthetic", description="synthetic (other rooms), or a folder of shards")
     correspondences: int | None = Field(1000, ge=3, description="most per training pair; None: all")
     motions_per_pair: int = Field(
-        8, ge=2, description="motions looked at per pair, by networks that judge motions"
+        8, ge=2, description="transforms looked at per pair, by networks that score transforms"
     )
     hidden_viewpoints: float = Field(
         0.1, ge=0, le=1, description="share of those pairs whose sensors' places are kept from the network"
@@ -43,7 +43,7 @@ class DataConfig(Section):
         ImagePairsConfig(), description="generated matches of two images, for networks with 4D input"
     )
     draw: DrawSettings = Field(
-        DrawSettings(), description="which pairs of described fragments are drawn, and how"
+        DrawSettings(), description="which pairs of fragments with features are drawn, and how"
     )
     augmentation: AugmentationConfig = AugmentationConfig()
 
@@ -69,7 +69,7 @@ class ValidationConfig(Section):
     every: int = Field(500, ge=1, description="steps")
     num_pairs: int = Field(64, ge=1)
     best_metric: Literal["recall", "f1", "verdict"] = Field(
-        "recall", description="what `best` is chosen by; verdict: for networks that judge motions"
+        "recall", description="what `best` is chosen by; verdict: for networks that score transforms"
     )
 
 
@@ -108,7 +108,7 @@ class TrainConfig(Section):
         given = self.data.augmentation
         if self.network.judges_motions and (given.rotate or given.swap or given.jitter):
             raise ValueError(
-                "a network that judges motions is trained with data.augmentation.rotate=false, swap=0 and "
+                "a network that scores transforms is trained with data.augmentation.rotate=false, swap=0 and "
                 "jitter=0: its channels do not change with rotation, and the others would not fit the motions"
             )
         if (
@@ -123,7 +123,7 @@ class TrainConfig(Section):
                 f"checkpoint_activations is for GeoMoE, not for '{self.network.kind}'; leave it out"
             )
         if self.validation.best_metric == "verdict" and not self.network.judges_motions:
-            raise ValueError("validation.best_metric=verdict is for networks that judge motions")
+            raise ValueError("validation.best_metric=verdict is for networks that score transforms")
         return self
 
 

@@ -1,4 +1,4 @@
-"""Training pairs from described fragments on disk: fresh correspondences in every epoch.
+"""Training pairs from fragments with features on disk: fresh correspondences in every epoch.
 
 Place: a pair dataset beside `ShardFolder` and `SyntheticPairs`; the drawing itself is in
 `geomoe3d.data.draw`. About 5 ms per pair of 1,000 keypoints on one core.

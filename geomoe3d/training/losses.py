@@ -53,7 +53,7 @@ class LossConfig(Section):
         gt=0,
         description="of an inlier beside an outlier in the plain form; a logit is 0 at odds of 1 to it",
     )
-    verdict_weight: float = Field(1.0, ge=0, description="of the verdict, for networks that judge motions")
+    verdict_weight: float = Field(1.0, ge=0, description="of the verdict, for networks that score transforms")
     similarity_weight: float = Field(1.0, ge=0, description="of features being alike, for PointDSC")
 
 
@@ -67,7 +67,7 @@ class Losses:
         regression: scalar, summed over layers, before its weight.
         balance: scalar, mean over layers.
         num_unsolved: layer-pairs left out of the regression because their weights fix no motion.
-        verdict: scalar, 0 for a network that judges no motions.
+        verdict: scalar, 0 for a network that scores no transforms.
         similarity: scalar, 0 for a network that compares no features.
     """
 

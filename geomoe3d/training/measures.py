@@ -75,7 +75,7 @@ def evaluate(
 ) -> dict[str, float]:
     """Mean measures over samples, with the model in evaluation mode (and put back).
 
-    For a network that judges motions they are those of the motion that it likes best, ``verdict_recall``
+    For a network that scores transforms they are those of the motion that it likes best, ``verdict_recall``
     being the share of pairs where that motion is right.
     """
     was_training = model.training

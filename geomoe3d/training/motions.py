@@ -1,6 +1,6 @@
-"""Motions to judge: for pairs drawn once from described fragments, what consensus proposes, kept on disk.
+"""Motions to judge: for pairs drawn once from fragments with features, what consensus proposes, kept on disk.
 
-A network that judges motions learns from right and wrong ones of the same pair. Finding them costs more
+A network that scores transforms learns from right and wrong ones of the same pair. Finding them costs more
 than a training step, so it is done once, with the estimator of registration itself. Place: between
 `geomoe3d.data.draw` and training; about 0.1 s per pair on one core, 0.03 MB on disk.
 """
@@ -65,7 +65,7 @@ def propose_motions(
     """Draw pairs and keep them with the motions that consensus proposes, in shards that training reads.
 
     Args:
-        features: folder of described fragments.
+        features: folder of fragments with features.
         out: folder of the shards; is made. Shards that are there are kept.
         num_pairs: in all, rounded up to whole shards; those for which no motion is proposed are left out.
         seed: another seed draws other pairs and keypoints.
@@ -73,7 +73,7 @@ def propose_motions(
         progress: called with (shards done, shards in all).
 
     Raises:
-        InputError: no described fragments there.
+        InputError: no fragments with features there.
         OutputError: the disk refuses, or the folder holds motions of other data, settings or seed.
     """
     pool_identity = FragmentPool(features, SETTINGS, seed, verify=True).identity()
@@ -114,7 +114,7 @@ def _check_identity(path: Path, wanted: dict[str, Any]) -> None:
     differs = [key for key in wanted if found.get(key) != wanted[key]]
     if differs:
         raise OutputError(
-            f"'{path.parent}' holds motions of another {' and '.join(differs)}; give another folder"
+            f"'{path.parent}' holds transforms of another {' and '.join(differs)}; give another folder"
         )
 
 

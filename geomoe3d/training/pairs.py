@@ -40,7 +40,7 @@ class TrainingPair:
         ratio: (N,) float32 or None.
         mutual: (N,) bool or None.
         motions: (K, 4, 4) float64 motions proposed for the pair, best first, or None; for networks that
-            judge motions.
+            score transforms.
         viewpoints: (2, 3) places of the source's and the target's sensor, or None where not known.
     """
 
@@ -250,7 +250,7 @@ def _check_shard(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     expected |= {name: (num_rows,) for name in OPTIONAL_CHANNELS if name in arrays}
     if "motions" in arrays:
         if "motion_start" not in arrays:
-            raise FormatError(f"shard '{path}' has motions but lacks motion_start")
+            raise FormatError(f"shard '{path}' has transforms but lacks motion_start")
         num_motions = int(arrays["motion_start"][-1])
         expected |= {"motion_start": (num_pairs + 1,), "motions": (num_motions, 4, 4)}
     if "viewpoints" in arrays:

@@ -44,7 +44,7 @@ class SyntheticConfig(Section):
     )
     inlier_threshold: float = Field(2.0, gt=0, description="residual below which a match is labelled true")
     structured_fraction: float = Field(
-        0.3, ge=0, le=1, description="largest share of the wrong matches that agree on other motions"
+        0.3, ge=0, le=1, description="largest share of the wrong matches that agree on other transforms"
     )
     surface_fraction: float = Field(
         0.5, ge=0, le=1, description="largest share of wrong matches that stay on the same or a like surface"

@@ -133,7 +133,7 @@ def _make(job: _Job) -> None:
     if not pairs:
         raise InputError(
             f"pairs {job.first} to {job.first + PAIRS_PER_SHARD - 1} of '{job.features}': consensus proposes "
-            "no motion for any; their fragments hold too few points, describe them on a finer grid"
+            "no transform for any; their fragments hold too few points, compute features on a finer grid"
         )
     write_shard(job.target, pairs)
 

@@ -53,13 +53,16 @@ class Weighed:
 
 
 def weigh(
-    given: Correspondences, estimator: EstimatorConfig | None = None, convinced: float = 3.0
+    given: Correspondences,
+    estimator: EstimatorConfig | None = None,
+    convinced: float = 3.0,
+    kept: float = 0.5,
 ) -> Weighed:
     """What bare correspondences come to with an untrained network."""
     config = RegistrationConfig(
         estimator=estimator or EstimatorConfig(),
         scoring={"scorers": ["surfaces"]},
-        expert={"correspondences": {"convinced": convinced}},
+        expert={"correspondences": {"convinced": convinced}, "keypoint_alignment": {"kept_agreement": kept}},
     )
     pipeline = Pipeline(config)
     pipeline.scorers["network"] = Given(MotionJudge(FoldedGeoMoE.of(network())))
@@ -163,13 +166,14 @@ def test_a_network_stops_where_it_has_seen_enough(convinced: float, looked_at: i
 def test_what_the_network_looks_at_is_drawn_closer(
     convinced: float, num_aligned: int, moved: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("geomoe3d.estimators.keypoint_alignment._KEPT_AGREEMENT", 0.0)  # wrong ones slide
     # The same proposals whether or not they are drawn closer.
     monkeypatch.setattr(ConsensusEstimator, "with_less_effort", lambda self: self)
     rows, _ = scene(3, share=0.1)
 
     def found(count: int, given: Correspondences) -> list[Hypothesis]:
-        return weigh(given, EstimatorConfig(num_aligned=count), convinced).hypotheses
+        return weigh(
+            given, EstimatorConfig(num_aligned=count), convinced, kept=0.0
+        ).hypotheses  # wrong ones slide
 
     def motions(hypotheses: list[Hypothesis]) -> set[bytes]:
         return {h.T_target_source.tobytes() for h in hypotheses}

@@ -12,13 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.config import expert
 from geomoe3d.runtime.threads import each
 from geomoe3d.types import FloatArray, IntArray
-
-PIXEL_DEG = 5.0
-"""Pixels of what a sensor saw: keypoints are sparse, finer ones would stay empty."""
-NORMAL_NEIGHBORS = 10
-"""Keypoints whose plane a keypoint lies in."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ class Surface:
         from scipy.spatial import cKDTree
 
         tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        k = min(NORMAL_NEIGHBORS, len(points))
+        k = min(expert().keypoints.normal_neighbors, len(points))
         _, near = tree.query(points, k=k)
         patch = points[np.asarray(near).reshape(len(points), k)]
         patch = patch - patch.mean(1, keepdims=True)
@@ -58,7 +54,7 @@ class Surface:
         if viewpoint is not None:
             away = np.einsum("ij,ij->i", normals, viewpoint - points) < 0
             normals = np.where(away[:, None], -normals, normals)
-            view = RangeImage.of(points, viewpoint, PIXEL_DEG)
+            view = RangeImage.of(points, viewpoint, expert().keypoints.pixel_deg)
         return cls(points, normals, planarity, tree, view, viewpoint)
 
 

@@ -23,7 +23,15 @@ from geomoe3d.config.expert_decision import (
     SharedSurfaceExpert,
     SimilarityExpert,
 )
-from geomoe3d.config.expert_proposing import CorrespondencesExpert
+from geomoe3d.config.expert_proposing import (
+    CorrespondencesExpert,
+    FeaturesExpert,
+    KeypointAlignmentExpert,
+    KeypointsExpert,
+    RansacExpert,
+    SurroundingsExpert,
+)
+from geomoe3d.config.expert_scoring import AlignmentExpert, NetworkExpert, SurfacesExpert
 from geomoe3d.config.section import Section
 
 P = ParamSpec("P")
@@ -41,6 +49,14 @@ class ExpertConfig(Section):
     similarity: SimilarityExpert = SimilarityExpert()
     causes: CausesExpert = CausesExpert()
     remarks: RemarksExpert = RemarksExpert()
+    features: FeaturesExpert = FeaturesExpert()
+    keypoints: KeypointsExpert = KeypointsExpert()
+    surroundings: SurroundingsExpert = SurroundingsExpert()
+    keypoint_alignment: KeypointAlignmentExpert = KeypointAlignmentExpert()
+    ransac: RansacExpert = RansacExpert()
+    surfaces: SurfacesExpert = SurfacesExpert()
+    network: NetworkExpert = NetworkExpert()
+    alignment: AlignmentExpert = AlignmentExpert()
 
 
 _IN_FORCE: ContextVar[ExpertConfig] = ContextVar("expert constants in force")

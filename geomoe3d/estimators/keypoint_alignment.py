@@ -15,16 +15,11 @@ from functools import cached_property
 
 import numpy as np
 
-from geomoe3d.clouds.keypoints import NORMAL_NEIGHBORS, KeypointSurfaces
-from geomoe3d.geometry.gicp import LEAST_MATCHED, LocalCloud, align
+from geomoe3d.clouds.keypoints import KeypointSurfaces
+from geomoe3d.config import expert
+from geomoe3d.geometry.gicp import LocalCloud, align
 from geomoe3d.geometry.se3 import residuals, shift_frames
 from geomoe3d.types import FloatArray, Hypothesis
-
-_UNITS = 2.0  # of `align` in an inlier threshold: a unit is a voxel where the threshold is two
-_REACH = 1.5  # inlier thresholds; wider slides along walls, narrower leaves motions where they were
-_MOST_STEPS = 4  # the first ones do it; more slide along walls
-_MOST_AGREEING = 0.2  # share of the correspondences from which on their own fit stands
-_KEPT_AGREEMENT = 0.5  # a motion that loses more of the correspondences than this has slid away
 
 
 class KeypointAligner:
@@ -44,7 +39,7 @@ class KeypointAligner:
     ) -> None:
         self._source, self._target = np.hsplit(correspondences, 2)
         self._threshold = inlier_threshold
-        self._unit = inlier_threshold / _UNITS
+        self._unit = inlier_threshold / expert().keypoint_alignment.units
         if surfaces is None:
             self._keypoints = [np.unique(side, axis=0) for side in (self._source, self._target)]
         else:
@@ -54,18 +49,19 @@ class KeypointAligner:
     def __call__(self, T_target_source: FloatArray) -> FloatArray:
         """The motion (4, 4) drawn closer, or the same: where a fifth of the correspondences agree with it,
         where fewer than ten keypoints meet, and where it would slide away."""
-        gaps = self._gaps(T_target_source)
-        if self._too_few or (gaps < self._threshold).mean() >= _MOST_AGREEING:
+        gaps, known = self._gaps(T_target_source), expert().keypoint_alignment
+        if self._too_few or (gaps < self._threshold).mean() >= known.most_agreeing:
             return T_target_source
         source_centre, target_centre = self._centres
         start = shift_frames(T_target_source, -source_centre, -target_centre)
         start[:3, 3] /= self._unit
-        T, _ = align(*self._clouds, start, np.zeros(3), reach=_UNITS * _REACH, max_iterations=_MOST_STEPS)
+        reach = known.units * known.reach
+        T, _ = align(*self._clouds, start, np.zeros(3), reach=reach, max_iterations=known.most_steps)
         if T is None:
             return T_target_source
         T[:3, 3] *= self._unit
         drawn = shift_frames(T, source_centre, target_centre)
-        if self._agreement(self._gaps(drawn)) < _KEPT_AGREEMENT * self._agreement(gaps):
+        if self._agreement(self._gaps(drawn)) < known.kept_agreement * self._agreement(gaps):
             return T_target_source
         return drawn
 
@@ -90,13 +86,13 @@ class KeypointAligner:
 
     @property
     def _too_few(self) -> bool:
-        return min(map(len, self._keypoints)) < LEAST_MATCHED
+        return min(map(len, self._keypoints)) < expert().alignment.least_matched
 
     @cached_property
     def _clouds(self) -> tuple[LocalCloud, LocalCloud]:
         # About the means: turns about a far origin are badly conditioned.
         source, target = (
-            LocalCloud.of((side - centre) / self._unit, NORMAL_NEIGHBORS)
+            LocalCloud.of((side - centre) / self._unit, expert().keypoints.normal_neighbors)
             for side, centre in zip(self._keypoints, self._centres, strict=True)
         )
         return source, target

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.config import EstimatorConfig
+from geomoe3d.config import EstimatorConfig, expert
 from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.geometry.rigid_fit import fit_rigid, spread, squared_residuals
 from geomoe3d.geometry.se3 import make_transform
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from geomoe3d.estimators.surroundings import Surroundings
-
-_MOST_REFITS = 50
 
 
 @estimator("ransac")
@@ -101,7 +99,7 @@ def _settle(T: FloatArray, rows: FloatArray, inlier_threshold: float) -> FloatAr
     depends on their race; from any of them this ends at the same fit.
     """
     before = np.zeros(len(rows), dtype=np.bool_)
-    for _ in range(_MOST_REFITS):
+    for _ in range(expert().ransac.most_refits):
         r2 = squared_residuals(T[None, :3, :3], T[None, :3, 3], rows[:, :3], rows[:, 3:])[0]
         inlier = r2 < inlier_threshold**2
         if inlier.sum() < 3 or (inlier == before).all():

@@ -17,21 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.clouds.keypoints import PIXEL_DEG, KeypointSurfaces
+from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.config import expert
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, FloatArray, IntArray
-
-_PLANE_SIGMA = 0.3  # of the sine between a plane and the line to the other point, both scans' difference
-_TURN_SIGMA = 0.35  # of the cosine between two planes, both scans' difference
-_LEAST_AGREEMENT = 0.1  # a pair's normals may both be badly fitted
-_MATCHED_FLOOR, _MATCHED_SLOPE, _MATCHED_LEAST = 0.3, 0.7, 0.05  # weight of a cosine: 1 at 1, 0.3 at 0
-_ASKED = 350  # at most so many points of each scan are sought in the other's free space
-_NEAR = 30.0  # thresholds from the sensor beyond which depths are shortened: pixels widen with the range
-_DEEPEST = 8.0  # thresholds in front of what was seen from where on a point counts fully
-_VIOLATION_WEIGHT = 32.0  # chosen among 8 to 64 on generated pairs, which rank on with it, and on real ones
-_LEAST_PLAUSIBILITY = 0.02  # a place that is wrongly taken for the sensor's must not decide everything
 
 
 @dataclass(frozen=True)
@@ -76,7 +67,7 @@ class Surroundings:
                 place = places[number]
                 if place is None:
                     return None
-                return RangeImage.of(points[number], place / inlier_threshold, PIXEL_DEG)
+                return RangeImage.of(points[number], place / inlier_threshold, expert().keypoints.pixel_deg)
 
             source_view, target_view = each(view, (0, 1))
         (p, q), (n, m) = points, normals
@@ -119,15 +110,16 @@ class Surroundings:
         ]
         error = self._difference(planes, places, rows) ** 2  # height of each point over the plane of a row
         error += self._difference(places, planes, rows) ** 2
-        error /= np.maximum(apart, 1.0) ** 2 * np.float32(2 * _PLANE_SIGMA**2)
+        known = expert().surroundings
+        error /= np.maximum(apart, 1.0) ** 2 * np.float32(2 * known.plane_sigma**2)
         turn = self._difference(self.normals, self.normals, rows)
         turn *= turn
-        turn *= np.float32(0.5 / _TURN_SIGMA**2)
+        turn *= np.float32(0.5 / known.turn_sigma**2)
         error += turn
         np.negative(error, out=error)
         np.exp(error, out=error)
-        error *= np.float32(1 - _LEAST_AGREEMENT)
-        error += np.float32(_LEAST_AGREEMENT)
+        error *= np.float32(1 - known.least_agreement)
+        error += np.float32(known.least_agreement)
         return error
 
     def _difference(self, left: Any, right: Any, rows: slice) -> Float32Array:
@@ -150,9 +142,10 @@ class Surroundings:
         cosine: Float32Array = R.reshape(-1, 9).astype(np.float32, copy=False) @ self._outer
         if not self.signed:
             np.abs(cosine, out=cosine)
-        cosine *= np.float32(_MATCHED_SLOPE)
-        cosine += np.float32(_MATCHED_FLOOR)
-        np.maximum(cosine, np.float32(_MATCHED_LEAST), out=cosine)
+        known = expert().surroundings
+        cosine *= np.float32(known.matched_slope)
+        cosine += np.float32(known.matched_floor)
+        np.maximum(cosine, np.float32(known.matched_least), out=cosine)
         return cosine
 
     def plausibility(self, R: NDArray[Any], t: FloatArray) -> FloatArray:
@@ -168,15 +161,16 @@ class Surroundings:
         """
         if self.views is None:
             return np.ones(len(R))
-        source_view, target_view = self.views
-        rows = drawn_rows(np.hstack(self.points), 1.0, _ASKED)
+        (source_view, target_view), known = self.views, expert().surroundings
+        rows = drawn_rows(np.hstack(self.points), 1.0, known.most_asked)
         p, q = (points[rows] for points in self.points)
         # R p + t of all motions as one product: einsum takes six times as long.
         moved = _turned(p, R) + t
         back = _turned(q, R.transpose(0, 2, 1)) - np.einsum("kji,kj->ki", R, t)
         asked = [(target_view, moved), (source_view, back)]
         one, other = each(lambda pair: _depth_in_front(*pair), asked)
-        factors: FloatArray = np.maximum(np.exp(-_VIOLATION_WEIGHT * (one + other)), _LEAST_PLAUSIBILITY)
+        through = np.exp(-known.violation_weight * (one + other))
+        factors: FloatArray = np.maximum(through, known.least_plausibility)
         return factors
 
 
@@ -191,7 +185,8 @@ def _depth_in_front(view: RangeImage, points: FloatArray) -> FloatArray:
     flat = points.reshape(-1, 3)
     seen, margin = view.margins(flat)
     away = flat - view.viewpoint
-    scale = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)) / _NEAR, 1.0)
-    depth = np.where(seen, np.clip(-margin / scale - 1, 0, _DEEPEST) / _DEEPEST, 0.0)
+    known = expert().surroundings
+    scale = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)) / known.near, 1.0)
+    depth = np.where(seen, np.clip(-margin / scale - 1, 0, known.deepest) / known.deepest, 0.0)
     means: FloatArray = depth.reshape(points.shape[:2]).mean(0)
     return means

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.features.base import Descriptor
 from geomoe3d.runtime.files import write_atomically
@@ -33,6 +33,7 @@ DEFAULT_MAX_BYTES = 4 * 2**30
 _SUFFIX = ".described.npz"
 _PREPARED_BY = "geomoe3d.clouds.prepare"
 _ABANDONED_SECONDS = 3600.0
+_CONSTANTS = ("features",)  # sections of `expert` that decide a cloud with features
 _COUNTS = ("num_input", "num_non_finite", "num_duplicates", "num_isolated")
 
 
@@ -138,6 +139,7 @@ def feature_identity(
         "voxel_size": float(voxel_size),
         "viewpoint": None if viewpoint is None else [float(value) for value in viewpoint],
         "preparation": config.model_dump(mode="json"),
+        "constants": {name: getattr(expert(), name).model_dump(mode="json") for name in _CONSTANTS},
         "descriptor": descriptor.identity(),
         "seed": seed,
         "code": source_hash(_PREPARED_BY),

@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.errors import CheckpointError
 from geomoe3d.features.base import Descriptor, descriptor
 from geomoe3d.features.fpfh import FpfhDescriptor
@@ -30,7 +31,6 @@ from geomoe3d.types import Float32Array, IntArray, PreparedCloud
 NUM_NEIGHBORS = 16
 LEARNED = 32
 DIMENSION = LEARNED + 33
-_FPFH_SHARE = 0.3  # of the similarity of two features; more hardly changes what is found
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
 _CHUNK = 256  # points at a time: what they and their neighbours hold stays near a core
 _EPSILON = np.float32(1e-5)  # of torch's layer norm
@@ -79,7 +79,8 @@ class LearnedDescriptor(Descriptor):
             return np.zeros((len(rows), DIMENSION), dtype=np.float32)
         with single_blas_thread():
             learned = _Network(self._tensors, levels).features(rows)
-        shares = np.sqrt(np.array([1 - _FPFH_SHARE, _FPFH_SHARE], dtype=np.float32))
+        share = expert().features.fpfh_share
+        shares = np.sqrt(np.array([1 - share, share], dtype=np.float32))
         return np.hstack([shares[0] * learned, shares[1] * given])
 
 

@@ -10,12 +10,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.features.base import Descriptor, descriptor
 from geomoe3d.features.pyramid import FACTORS, nearest, pyramid
 from geomoe3d.types import Float32Array, PreparedCloud
-
-_NEAR = 3
-_SOFT = np.float32(0.4)  # voxels: a point nearer than that hardly weighs more
 
 
 @descriptor("multiscale")
@@ -32,8 +30,8 @@ class MultiscaleDescriptor(Descriptor):
         fine, *coarser = pyramid(cloud)
         joined = [fine.features]
         for level in coarser:
-            distance, rows = nearest(fine, level, _NEAR)
-            weight = 1 / (distance + _SOFT)
+            distance, rows = nearest(fine, level, expert().features.num_nearest)
+            weight = 1 / (distance + expert().features.softening)
             joined.append(_of_length_one(np.einsum("mk,mkc->mc", weight, level.features[rows])))
         return _of_length_one(np.hstack(joined))
 

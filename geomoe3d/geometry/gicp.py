@@ -11,17 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse, project_to_so3, rotation_angle_deg
 from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import FloatArray
-
-LEAST_MATCHED = 10
-"""Matching points below which an alignment is not believed."""
-_MAX_TURN_DEG = 45.0  # a local method that turns further has left the motion it was to polish
-_MAX_SHIFT = 6.0  # voxels
-# A step that moves less (and turns less than 0.1 deg, the library's own) ends it; ten times less takes twice
-# the steps for nothing.
-_STILL = 0.01
 
 
 class LocalCloud(NamedTuple):
@@ -89,20 +82,21 @@ def align(
         max_correspondence_distance=reach,
         num_threads=1,
         max_iterations=max_iterations,
-        translation_epsilon=_STILL,
+        translation_epsilon=expert().alignment.still,
     )
     T = np.array(answer.T_target_source, dtype=np.float64)
     num_matched = answer.num_inliers if np.isfinite(T).all() else 0
-    if num_matched < LEAST_MATCHED:
+    if num_matched < expert().alignment.least_matched:
         return Aligned(None, too_few(num_matched))
     T[:3, :3] = project_to_so3(T[:3, :3])
     shift = float(np.linalg.norm((T - start) @ np.append(centre, 1.0)))
     turn = rotation_angle_deg((inverse(start) @ T)[:3, :3])
-    if shift > _MAX_SHIFT or turn > _MAX_TURN_DEG:
+    if shift > expert().alignment.most_shift or turn > expert().alignment.most_turn_deg:
         return Aligned(None, f"refinement slid away by {turn:.1f} deg and {shift:.1f} voxels")
     return Aligned(T, None)
 
 
 def too_few(num_matched: int) -> str:
     """The sentence for so few matching points."""
-    return f"refinement found only {num_matched} matching points (it needs {LEAST_MATCHED})"
+    least = expert().alignment.least_matched
+    return f"refinement found only {num_matched} matching points (it needs {least})"

@@ -14,17 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.config import RefinementConfig
-from geomoe3d.geometry.gicp import LEAST_MATCHED, Aligned, LocalCloud, align, too_few
+from geomoe3d.config import RefinementConfig, expert
+from geomoe3d.geometry.gicp import Aligned, LocalCloud, align, too_few
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.refinement.base import PairRefiner, Refiner, refiner
 from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
-_MARGIN_VOXELS = (
-    2.5  # beyond the reach: points may come nearer in the course, and normals need their neighbours
-)
-_NORMAL_NEIGHBORS = 20
 _UNREFINED = "the unrefined transform is given"
 
 
@@ -98,7 +94,7 @@ class CloudAligner:
             return T_target_source, f"{found.problem}; {_UNREFINED}"
         T = found.T_target_source
         moved = transform_points(T, near.points) - transform_points(start, near.points)
-        if np.sum(moved**2, axis=1).max() > (_MARGIN_VOXELS / 2) ** 2:
+        if np.sum(moved**2, axis=1).max() > (expert().alignment.margin / 2) ** 2:
             near = self._near(T)
         again = self._aligned(near, T).T_target_source
         T = T if again is None else again
@@ -125,16 +121,15 @@ class CloudAligner:
         source = self._source[self._close(1, transform_points(start, self._source))]
         target = self._target[self._close(0, transform_points(inverse(start), self._target))]
         num_matched = min(len(source), len(target))
-        if num_matched < LEAST_MATCHED:
+        if num_matched < expert().alignment.least_matched:
             return _Near(source, num_matched, None, None)
-        neighbors = _NORMAL_NEIGHBORS if self._config.name == "gicp" else None
-        return _Near(
-            source, num_matched, LocalCloud.of(source, neighbors), LocalCloud.of(target, _NORMAL_NEIGHBORS)
-        )
+        neighbors = expert().alignment.normal_neighbors
+        ours = neighbors if self._config.name == "gicp" else None
+        return _Near(source, num_matched, LocalCloud.of(source, ours), LocalCloud.of(target, neighbors))
 
     def _close(self, which: int, points: FloatArray) -> IntArray:
         """Which points (n, 3), in voxels, have one of a cloud's within the reach of the refinement and some more."""
-        reach = (self._config.max_distance + _MARGIN_VOXELS) * self._voxel
+        reach = (self._config.max_distance + expert().alignment.margin) * self._voxel
         places = points * self._voxel
         distance, _ = self._trees[which].query(places, distance_upper_bound=reach, workers=usable_threads())
         return np.flatnonzero(np.isfinite(distance))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.config import PartConfig
+from geomoe3d.config import PartConfig, expert
 from geomoe3d.errors import CheckpointError
 from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, check_weights, judges_transforms
 from geomoe3d.runtime.files import file_hash
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 
 NETWORK = "network"
 _RUN_BY = "geomoe3d.networks.motion_judge"
-_VERDICT_WEIGHT = 0.5
-_MOST_VERDICT = 8.0
-_UNSEEN_VERDICT = -3.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,8 @@ class Opinion:
     @property
     def factor(self) -> float:
         """exp(verdict / 2), the verdict bounded to [-8, 8]."""
-        return float(np.exp(_VERDICT_WEIGHT * min(max(self.verdict, -_MOST_VERDICT), _MOST_VERDICT)))
+        known = expert().network
+        return float(np.exp(known.weight * min(max(self.verdict, -known.most), known.most)))
 
     @property
     def output(self) -> FilterOutput | None:
@@ -130,4 +128,4 @@ class NetworkScorer(Scorer):
 
     def unasked(self, known: Sequence[Score]) -> Opinion:
         """As bad as the worst that it was asked about, or -3."""
-        return Opinion(min([_UNSEEN_VERDICT, *(o.verdict for o in known if isinstance(o, Opinion))]))
+        return Opinion(min([expert().network.unseen, *(o.verdict for o in known if isinstance(o, Opinion))]))

@@ -18,6 +18,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.config import expert
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
@@ -30,12 +31,8 @@ if TYPE_CHECKING:
 SURFACES = "surfaces"
 """Name of the scorer without which nothing is said of an answer."""
 
-_NUM_RANDOM = 256  # random target features per source point: p-values down to 1/257
 _LIFT = 4.0  # more than two similarities of unit features can differ by
 _AT_ONCE = 5  # hypotheses asked about together, for any number of threads
-_LEAST_COSINE = 0.7  # normals of one surface, estimated twice, differ by less than 45 degrees
-_VIOLATION_WEIGHT = 10.0  # a tenth of the visible points in free space divides the score by e
-_VISIBLE_FLOOR = 0.05  # fewer visible points than this share make the violation rate unreliable
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,8 @@ class Evidence:
     @property
     def surface_score(self) -> float:
         """See the class."""
-        return max(self.distinctiveness, 0.0) * float(np.exp(-_VIOLATION_WEIGHT * self.free_space_violation))
+        weight = expert().surfaces.violation_weight
+        return max(self.distinctiveness, 0.0) * float(np.exp(-weight * self.free_space_violation))
 
     @property
     def factor(self) -> float:
@@ -131,7 +129,7 @@ class Verifier:
             )
         edge = target.voxel_size
         chosen = drawn_rows(source.points, edge, num_queries, seed)
-        random_targets = drawn_rows(target.points, edge, _NUM_RANDOM, seed + 1)
+        random_targets = drawn_rows(target.points, edge, expert().surfaces.num_random, seed + 1)
         self._threshold = inlier_threshold
         self._points, self._normals = source.points[chosen], source.normals[chosen]
         # Products of float32 differ in their last bits with the number of threads; those of float64, rounded,
@@ -180,7 +178,7 @@ class Verifier:
         turned = (self._normals @ R.transpose(0, 2, 1)).reshape(-1, 3)[hit]
         cosine = np.einsum("ij,ij->i", turned, self._target.normals[nearest])
         # Without both sensor positions the normals' signs are a guess, and only their lines can be compared.
-        agrees = (cosine if self._signed else np.abs(cosine)) > _LEAST_COSINE
+        agrees = (cosine if self._signed else np.abs(cosine)) > expert().surfaces.least_cosine
         # -ln p of a uniform p has mean 1, so chance overlap sums to zero.
         surprise = -np.log(self._chance(asked[agrees], nearest[agrees])) - 1
         surprise *= 1 - (distance[agrees] / self._threshold) ** 2
@@ -211,5 +209,5 @@ class Verifier:
                 values.reshape(points.shape[:2]) for values in view.margins(points.reshape(-1, 3))
             )
             through = (margins < -2 * self._threshold).sum(1)
-            total += through / (seen.sum(1) + _VISIBLE_FLOOR * points.shape[1])
+            total += through / (seen.sum(1) + expert().surfaces.visible_floor * points.shape[1])
         return total

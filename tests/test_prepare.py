@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from surface_pairs import corner
 
 from geomoe3d.clouds.prepare import (
+    _size_for_count,
     bounded_voxel_size,
     check_cloud,
     choose_voxel_size,
@@ -19,6 +20,7 @@ from geomoe3d.clouds.prepare import (
     drop_isolated,
     estimate_normals,
     orient_normals,
+    own_voxel_sizes,
     prepare,
     scale_mismatch,
     typical_spacing,
@@ -331,6 +333,18 @@ def test_a_voxel_size_is_found_for_the_smallest_clouds(count: int) -> None:
     points = np.random.default_rng(count).uniform(0, 1, (count, 3))
     size = choose_voxel_size(PointCloud(points), PointCloud(points), 5000)
     assert 2 * np.median(cKDTree(points).query(points, k=2)[0][:, 1]) * 0.8 <= size <= 2
+
+
+def test_foliage_gets_half_the_grid_of_surfaces():
+    rng = np.random.default_rng(3)
+    crowns = rng.uniform(0, 40, (60, 3)) * (1, 1, 0.2)
+    leaves = crowns[rng.integers(60, size=60_000)] + rng.normal(0, 1.5, (60_000, 3))
+    plain = _size_for_count(leaves, 3500)
+    assert own_voxel_sizes(PointCloud(leaves), PointCloud(leaves), 3500)[0] == pytest.approx(plain / 2)
+    ground = rng.uniform(0, 40, (60_000, 3)) * (1, 1, 0)
+    walls = np.concatenate([ground, ground[:, [0, 2, 1]], ground[:, [2, 0, 1]]])
+    size = own_voxel_sizes(PointCloud(walls), PointCloud(walls), 3500)[0]
+    assert size == pytest.approx(_size_for_count(walls, 3500))
 
 
 def test_one_point_a_million_metres_away_is_named_as_stray() -> None:

@@ -25,6 +25,10 @@ _RAMP, _AT_WALL, _LEAST_HELD, _FULL = 0.05, 1e-3, 0.01, 0.1
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
 _SPACING_POINTS = 20_000
 _BITS = 21  # of a 64-bit voxel key, for each axis
+# Whether points fill space: how many are looked at, within how many voxels, with how many neighbours at least; how many
+# are asked, and the variation from which they do: few at first.
+_SCATTER_SAMPLE, _SCATTER_RADIUS, _SCATTER_LEAST = 20_000, 2.5, 8
+_SCATTERED = ((40, 0.11), (400, 0.15))
 
 
 def prepare(
@@ -85,8 +89,9 @@ def prepare(
 def choose_voxel_size(source: PointCloud, target: PointCloud, num_points: int) -> float:
     """A voxel size for two clouds from their extent and density, cloud units.
 
-    It is the size at which the larger cloud occupies about ``num_points`` voxels, but about twice the typical spacing
-    of the sparser cloud at least, below which a grid no longer evens out density; see `round_size`.
+    It is the size at which the larger cloud occupies about ``num_points`` voxels, half of it where its points fill
+    space as foliage does, but about twice the typical spacing of the sparser cloud at least, below which a grid no
+    longer evens out density; see `round_size`.
 
     Both clouds must have passed `check_cloud`.
     """
@@ -107,7 +112,9 @@ def own_voxel_sizes(source: PointCloud, target: PointCloud, num_points: int) -> 
     """The voxel size that each of two clouds would get by itself, see `choose_voxel_size`; not rounded."""
 
     def of(cloud: PointCloud) -> float:
-        return max(_size_for_count(cloud.points, num_points), 2.0 * typical_spacing(cloud.points))
+        size, least = _size_for_count(cloud.points, num_points), 2.0 * typical_spacing(cloud.points)
+        # Where foliage fills space, a grid for surfaces shows next to nothing of it.
+        return max(size / 2 if size > least and _fills_space(cloud.points, size) else size, least)
 
     first, second = each(of, (source, target))
     return first, second
@@ -192,6 +199,37 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
         step, fine, coarse = step - 1, count(step - 1), fine
     share = np.log(fine / goal) / np.log(fine / coarse) if fine > coarse else 1.0
     return float(min(2.0 ** ((step + share) / 2), extent))
+
+
+def _fills_space(points: FloatArray, voxel_size: float) -> bool:
+    """Whether points lie as in foliage, not as on surfaces; 3 ms for most clouds.
+
+    Of 51 recorded pairs and 72 indoor fragments the variation is at most 0.13, of two pairs of airborne tiles and
+    one of forest 0.17 to 0.19.
+    """
+    means = voxel_means(points[:: max(1, len(points) // _SCATTER_SAMPLE)], voxel_size)
+    return all(_surface_variation(means, voxel_size, asked) > most for asked, most in _SCATTERED)
+
+
+def _surface_variation(points: FloatArray, voxel_size: float, count: int) -> float:
+    """Share of the variance of what surrounds a point that is along its normal, median of so many points: 0 for planes,
+    1/3 for what fills space. 0 where too few have neighbours.
+
+    Source: Pauly et al., IEEE Visualization 2002.
+    """
+    places = (points - points.mean(0)) / voxel_size
+    asked = places[:: max(1, len(places) // count)]
+    squared = (asked**2).sum(1)[:, None] + (places**2).sum(1) - 2 * asked @ places.T
+    near = (squared < _SCATTER_RADIUS**2).astype(np.float64)
+    held = near.sum(1)
+    near = near[held >= _SCATTER_LEAST] / held[held >= _SCATTER_LEAST, None]
+    if len(near) < _SCATTER_LEAST:
+        return 0.0
+    products = np.einsum("ni,nj->nij", places, places).reshape(-1, 9)
+    means = near @ places
+    covariance = (near @ products).reshape(-1, 3, 3) - np.einsum("ni,nj->nij", means, means)
+    along = np.linalg.eigvalsh(covariance)
+    return float(np.median(along[:, 0] / np.maximum(along.sum(1), 1e-12)))
 
 
 def typical_spacing(points: FloatArray) -> float:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geomoe3d.errors import ConfigError
-from geomoe3d.images.epipolar import essential_of, label_threshold, symmetric_distance
+from geomoe3d.geometry.essential import essential_of, label_threshold, symmetric_distance
 from geomoe3d.images.generate import ImagePairsConfig, generate_matches, neighbors_of
 from geomoe3d.training.batches import ImagePairs
 from geomoe3d.training.config import load_train_config

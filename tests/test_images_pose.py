@@ -12,9 +12,10 @@ from image_scenes import CAMERA, matches_of, texture
 
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.errors import CheckpointError, InputError, MissingFileError
+from geomoe3d.geometry.homography import weighted_dlt
 from geomoe3d.images.cameras import Camera, rotation_deg
 from geomoe3d.images.features import detect, match
-from geomoe3d.images.homography import corner_error, find_homography, map_points, weighted_dlt
+from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
 from geomoe3d.networks.architecture import NetworkConfig

@@ -37,11 +37,28 @@ def command() -> None:
 def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None:
     """Say which layout ROOT has, compare it with what was published, and name every broken file.
 
+    Of photographs with cameras it says how far matches lie from the epipolar lines that the cameras give.
+
     Exit code 0 when every listed pair can be used, else 2.
     """
+    from pathlib import Path
+
     from geomoe3d.cli.progress import progress_bar
     from geomoe3d.data.check import check_folder
+    from geomoe3d.images.scenes import layout_of, read_scene
 
+    if layout_of(Path(root)) is not None:
+        from geomoe3d.images.check import check_truth
+
+        truth = check_truth(read_scene(root))
+        click.echo(json.dumps(asdict(truth)) if as_json else (
+            f"{root}: photographs with cameras, layout {truth.layout}, {truth.num_views} views"
+            + "".join(f"\nnote: {note}" for note in truth.notes)
+            + f"\n{truth.num_matches:,} matches of {truth.num_pairs} pairs: {truth.share:.0%} within 2 pixels of their "
+            f"epipolar lines (at least 60 %), median {truth.median:.2f} (at most 1)\n"
+            + ("usable" if truth.usable else "not usable: the cameras are not those of the photographs")
+        ))  # fmt: skip
+        context.exit(0 if truth.usable else BAD_INPUT)
     with progress_bar("fragments", quiet=as_json) as advance:
         report = check_folder(root, open_files=not quick, progress=advance)
     if as_json:

@@ -184,6 +184,55 @@ def methods() -> None:
         click.echo(f"{name:24} {'correspondences':26} with weights of yours: --set filter.weights=FILE")
 
 
+@command.command(context_settings=HELP)
+@click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=click.Path(exists=True))
+@click.option("--weights", type=click.Path(), help="Network that weighs matches (.safetensors).")
+@click.option("--pairs", default=200, show_default=True, type=click.IntRange(min=2), help="Per scene.")
+@click.option("--homographies", is_flag=True, help="Homographies in place of poses.")
+@click.option("--images", type=click.Path(), help="Where the images of a list of pairs lie.")
+@click.option("--output", type=click.Path(), help="Write all errors as JSON.")
+@click.option("--force", is_flag=True, help="Replace a file that exists.")
+@traceback_option
+def images(
+    folders: tuple[str, ...], weights: str | None, pairs: int, homographies: bool, images: str | None,
+    output: str | None, force: bool,
+) -> None:  # fmt: skip
+    """Measure poses or homographies of photographs: areas under the recall curve, with intervals.
+
+    For poses each FOLDER holds photographs with cameras, or is a list of pairs as published for YFCC100M and
+    ScanNet (38 words a line). For homographies it is a sequence of HPatches, a folder with NAME_pts.txt and
+    NAME_model.txt, or any images, of which exact warps are made.
+    """
+    import json
+
+    from geomoe3d.cli.progress import progress_bar
+    from geomoe3d.images.evaluate import (
+        CORNER_LIMITS,
+        POSE_LIMITS,
+        outcomes_of,
+        summarise,
+        to_json,
+        to_markdown,
+    )
+    from geomoe3d.images.network import ImageNetwork
+    from geomoe3d.runtime.files import check_output, write_text
+
+    if output is not None:
+        check_output(output, force=force)
+    network = None if weights is None else ImageNetwork(weights)
+    outcomes = []
+    with progress_bar("scenes") as advance:
+        for number, folder in enumerate(folders, 1):
+            outcomes += outcomes_of(
+                Path(folder), network, pairs, homographies, None if images is None else Path(images)
+            )
+            advance(number, len(folders))
+    table = summarise(outcomes, CORNER_LIMITS if homographies else POSE_LIMITS)
+    click.echo(to_markdown(table, len({(one.scene, one.pair) for one in outcomes})), nl=False)
+    if output is not None:
+        write_text(Path(output), json.dumps(to_json(outcomes, table)) + "\n", force=force)
+
+
 def _predict(
     study: str,
     methods: tuple[str, ...],

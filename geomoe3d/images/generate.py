@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from geomoe3d.config import Section
-from geomoe3d.images.epipolar import (
+from geomoe3d.geometry.essential import (
     cross_matrix,
     essential_of,
     homogeneous,

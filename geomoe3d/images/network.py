@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from geomoe3d.errors import CheckpointError
-from geomoe3d.images.epipolar import MIN_MATCHES
+from geomoe3d.geometry.essential import MIN_MATCHES
 from geomoe3d.images.generate import neighbors_of
 from geomoe3d.networks.pretrained import load_network
 from geomoe3d.types import FloatArray, IntArray

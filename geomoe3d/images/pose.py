@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from geomoe3d.errors import InputError
-from geomoe3d.images.cameras import Camera, opencv, rotation_deg
-from geomoe3d.images.epipolar import (
+from geomoe3d.geometry.essential import (
     MIN_MATCHES,
     decompose,
     depths,
@@ -24,6 +23,7 @@ from geomoe3d.images.epipolar import (
     symmetric_distance,
     weighted_eight_point,
 )
+from geomoe3d.images.cameras import Camera, opencv, rotation_deg
 from geomoe3d.images.features import checked
 from geomoe3d.types import BoolArray, FloatArray
 
@@ -184,9 +184,7 @@ def _judged(
                 f"{found} inliers, where matches shuffled at random have {chance:.0f} under this pose"
             )
         x = rays[inliers]
-        turned = _turned(x)
-        beyond = np.linalg.norm(turned[:, :2] - x[:, 2:], axis=1)
-        parallax = float(np.median(beyond))
+        parallax = float(np.median(np.linalg.norm(_turned(x) - x[:, 2:], axis=1)))
         if parallax < _LEAST_PARALLAX * threshold:
             ambiguous = True
             reasons.append(
@@ -214,17 +212,16 @@ def _by_chance(T: FloatArray, rays: FloatArray, threshold: float, rounds: int = 
 
 
 def _turned(x: FloatArray) -> FloatArray:
-    """First rays of matches (N, 4) under the rotation that best lays them on the second ones, as (N, 3), z = 1."""
-    from scipy.spatial.transform import Rotation
-
+    """First rays of matches (N, 4) under the rotation that best lays them on the second ones, (N, 2)."""
     first, second = (np.column_stack([x[:, k : k + 2], np.ones(len(x))]) for k in (0, 2))
     first, second = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (first, second))
     weights = np.ones(len(x))
     for _ in range(5):  # far points decide: those that the rotation alone explains
-        R, _ = Rotation.align_vectors(second, first, weights)
-        weights = 1 / (1e-4 + np.linalg.norm(R.apply(first) - second, axis=1))
-    moved = R.apply(first)
-    return np.asarray(moved / np.maximum(moved[:, 2:], 1e-9))
+        U, _, Vt = np.linalg.svd((second * weights[:, None]).T @ first)
+        R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        weights = 1 / (1e-4 + np.linalg.norm(first @ R.T - second, axis=1))
+    moved: FloatArray = first @ R.T
+    return moved[:, :2] / np.maximum(moved[:, 2:], 1e-9)
 
 
 def _of_a_plane(T: FloatArray, x: FloatArray, threshold: float) -> tuple[FloatArray, ...]:

@@ -16,14 +16,14 @@ from pydantic import Field
 from torch import Tensor
 
 from geomoe3d.config import Section
-from geomoe3d.geometry.kabsch import weighted_kabsch
-from geomoe3d.images.epipolar import (
+from geomoe3d.geometry.essential import (
     MIN_MATCHES,
     essential_of,
     symmetric_distance,
     virtual_matches,
     weighted_eight_point,
 )
+from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.networks.geomoe import GeoMoEOutput
 from geomoe3d.networks.layers import weights_from_logits
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from geomoe3d.geometry.essential import decompose, pose_errors_deg, weighted_eight_point
 from geomoe3d.geometry.kabsch import weighted_kabsch
-from geomoe3d.images.epipolar import decompose, pose_errors_deg, weighted_eight_point
 from geomoe3d.networks.build import Network
 from geomoe3d.networks.layers import weights_from_logits
 from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch

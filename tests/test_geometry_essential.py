@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geomoe3d.images.epipolar import (
+from geomoe3d.geometry.essential import (
     decompose,
     depths,
     essential_of,

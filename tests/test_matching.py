@@ -299,3 +299,18 @@ def test_matches_of_two_kinds_stand_together_once_each() -> None:
         assert len(getattr(both, name)) == len(both)
     bare = first.with_others(replace(second, mutual=None, normals=None))
     assert bare.mutual is None and bare.normals is None and len(bare) == len(both)
+
+
+@pytest.mark.parametrize("step", [7, 1_000_000])
+def test_dual_softmax_is_the_product_of_both_softmaxes(step: int, monkeypatch) -> None:
+    from geomoe3d.matching import dual_softmax
+
+    monkeypatch.setattr(dual_softmax, "_BLOCK_ENTRIES", step * 40)
+    rng = np.random.default_rng(3)
+    a, b = (rng.normal(size=(n, 8)) for n in (30, 40))
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    e = np.exp(a @ b.T / 0.1)
+    product = e / e.sum(1, keepdims=True) * e / e.sum(0, keepdims=True)
+    column, log_score = dual_softmax.best_by_dual_softmax(a.astype(np.float32), b.astype(np.float32), 0.1)
+    assert np.array_equal(column, product.argmax(1))
+    assert np.allclose(log_score, np.log(product.max(1)), atol=1e-4)

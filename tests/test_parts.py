@@ -42,7 +42,7 @@ EXAMPLES = ROOT / "examples"
     ("registry", "names"),
     [
         (descriptor, {"fpfh"}),
-        (matcher, {"one_way", "mutual", "ratio"}),
+        (matcher, {"one_way", "mutual", "ratio", "dual_softmax"}),
         (outlier_filter, {"none", "spectral", "geomoe"}),
         (estimator, {"consensus", "ransac", "svd"}),
         (scorer, {"surfaces", "network"}),

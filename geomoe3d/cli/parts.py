@@ -12,7 +12,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 _PARTS = (
     ("descriptor", "descriptor.name", "Features of each point: fpfh, multiscale or learned. [fpfh]"),
-    ("matcher", "matching.name", "one_way, mutual or ratio. [one_way]"),
+    ("matcher", "matching.name", "one_way, mutual, ratio or dual_softmax. [one_way]"),
     ("filter", "filter.name", "Outlier rejection: none, spectral, or a network. [none]"),
     ("estimator", "estimator.name", "consensus, ransac or svd. [consensus]"),
     ("refiner", "refinement.name", "gicp, icp, svd or none. [gicp]"),

@@ -57,7 +57,8 @@ class MatchingConfig(PartConfig):
     name: str = Field(
         "one_way",
         description="one_way keeps each source point's nearest target, mutual only where that is mutual, ratio "
-        "only where the second best is clearly worse; or a class of your own",
+        "only where the second best is clearly worse, dual_softmax the pairs that prefer each other most; or a "
+        "class of your own",
     )
     neighbors: int = Field(1, ge=1, le=10, description="targets kept per source point")
     max_ratio: float = Field(0.95, gt=0, le=1, description="largest distance ratio kept by ratio")

@@ -87,10 +87,11 @@ class Map:
         """Describe a cloud as a map.
 
         Args:
-            cloud: anything `load_points` takes; LAS and LAZ files are read in pieces, so that memory is bounded by
+            cloud: anything `load_points` takes; LAS, LAZ and E57 files are read in pieces, so that memory is bounded by
                 what the map keeps: four million voxels at most, on a grid twice as wide where that is not enough.
             sensor: (3,) where the one sensor stood, file coordinates; None takes what the file itself says, and none
-                where it says nothing, as merged clouds do. The origin of a map is never taken for one.
+                where it says nothing, as merged clouds do; of an E57 file, what each of its scans says. The origin of
+                a map is never taken for one.
             config: of the registrations; None takes the defaults.
             progress: called with the name of each stage as it begins.
             overrides: top-level configuration keys, as of `geomoe3d.register`; ``voxel_size`` is the grid on which
@@ -156,12 +157,13 @@ class Map:
         tell("load")
         T = np.eye(4) if T_map_cloud is None else check_motion(T_map_cloud)
         read = pieces(cloud, _PIECE)
-        told = read.sensor if sensor is None else np.asarray(sensor, dtype=np.float64)
-        place = None if told is None else transform_points(T, told[None])[0]
+        told = None if sensor is None else np.asarray(sensor, dtype=np.float64)
         if any(read.sha256 == source.sha256 for source in self.sources):
             return self
         voxels, count = self._voxels, 0
-        for points in read.points():
+        for points, seen_from in read.points():
+            eye = seen_from if told is None else told
+            place = None if eye is None else transform_points(T, eye[None])[0]
             moved = points if T_map_cloud is None else transform_points(T, points)
             if not len(voxels):
                 voxels = _first(moved, read.name, read.origin if T_map_cloud is None else None)

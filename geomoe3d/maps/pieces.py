@@ -1,4 +1,4 @@
-"""Clouds too large for memory, read in pieces: LAS and LAZ as they stream, all else at once."""
+"""Clouds too large for memory, read in pieces: LAS and LAZ as they stream, E57 scan by scan, all else at once."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from geomoe3d.clouds.formats.e57 import read_scans
 from geomoe3d.clouds.formats.las import read_pieces
 from geomoe3d.clouds.io import load_points
 from geomoe3d.errors import EmptyCloudError
@@ -16,7 +17,8 @@ from geomoe3d.geometry.columns import finite_rows
 from geomoe3d.runtime.files import file_hash
 from geomoe3d.types import FloatArray
 
-_STREAMED = (".las", ".laz")
+Piece = tuple[FloatArray, FloatArray | None]
+"""Finite points (n, 3) and where the one sensor that saw them stood, or None; file coordinates."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +28,13 @@ class Pieces:
     Attributes:
         name: what to call it.
         sha256: of the file, or of the points of a cloud in memory.
-        points: gives its finite points (n, 3) in file coordinates, piece by piece.
-        sensor: (3,) where the file says that its one sensor stood, file coordinates, or None.
+        points: gives it piece by piece.
         origin: (3,) of the local coordinates of a cloud that was read at once, else None.
     """
 
     name: str
     sha256: str
-    points: Callable[[], Iterator[FloatArray]]
-    sensor: FloatArray | None = None
+    points: Callable[[], Iterator[Piece]]
     origin: FloatArray | None = None
 
 
@@ -44,32 +44,42 @@ def pieces(cloud: Any, size: int) -> Pieces:
     Raises:
         InputError, FormatError, EmptyCloudError: as `load_points`; of a streamed file while it is read.
     """
-    if (
-        isinstance(cloud, (str, os.PathLike))
-        and Path(cloud).suffix.lower() in _STREAMED
-        and Path(cloud).is_file()
-    ):
-        path = Path(cloud)
-        return Pieces(path.name, file_hash(path), lambda: _finite(path, size))
+    path = Path(cloud) if isinstance(cloud, (str, os.PathLike)) else None
+    stream = None if path is None else _STREAMED.get(path.suffix.lower())
+    if path is not None and stream is not None and path.is_file():
+        return Pieces(path.name, file_hash(path), lambda: _finite(path, stream(path, size)))
     loaded = load_points(cloud)
-    if isinstance(cloud, (str, os.PathLike)):
-        digest = file_hash(Path(cloud))
+    if path is not None:
+        digest = file_hash(path)
     else:
         digest = hashlib.sha256(loaded.points.tobytes() + loaded.origin.tobytes()).hexdigest()
 
-    def parts() -> Iterator[FloatArray]:
+    def parts() -> Iterator[Piece]:
         for start in range(0, len(loaded), size):
-            yield loaded.points[start : start + size] + loaded.origin
+            yield loaded.points[start : start + size] + loaded.origin, loaded.sensor
 
-    return Pieces(loaded.name, digest, parts, loaded.sensor, loaded.origin)
+    return Pieces(loaded.name, digest, parts, loaded.origin)
 
 
-def _finite(path: Path, size: int) -> Iterator[FloatArray]:
+def _laser_pieces(path: Path, size: int) -> Iterator[Piece]:
+    return ((points, None) for points in read_pieces(path, size))
+
+
+def _scan_pieces(path: Path, size: int) -> Iterator[Piece]:
+    for scan in read_scans(path):
+        for start in range(0, len(scan.points), size):
+            yield scan.points[start : start + size], scan.sensor
+
+
+_STREAMED = {".las": _laser_pieces, ".laz": _laser_pieces, ".e57": _scan_pieces}
+
+
+def _finite(path: Path, given: Iterator[Piece]) -> Iterator[Piece]:
     some = False
-    for points in read_pieces(path, size):
+    for points, sensor in given:
         points = points[finite_rows(points)]
         some |= bool(len(points))
         if len(points):
-            yield points
+            yield points, sensor
     if not some:
         raise EmptyCloudError(f"'{path}' holds no finite points")

@@ -8,6 +8,7 @@ whole. 64 bytes per voxel; a million points take some 0.3 s.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -139,10 +140,20 @@ Columns = tuple[IntArray, FloatArray, IntArray, FloatArray]
 
 
 def _joined(old: Columns, new: Columns) -> Columns:
+    """Both, one row per key; what is there already is not sorted again."""
     if not len(old[0]):
         return new
-    keys, sums, counts, towards = (np.concatenate(pair) for pair in zip(old, new, strict=True))
-    return _summed(keys, sums, counts, towards)
+    place = np.searchsorted(old[0], new[0])
+    known = old[0][np.minimum(place, len(old[0]) - 1)] == new[0]
+    held, fresh = place[known], place[~known]
+
+    def column(before: Any, added: Any) -> Any:
+        summed = before.copy()
+        summed[held] += added[known]
+        return np.insert(summed, fresh, added[~known], axis=0) if len(fresh) else summed
+
+    keys = np.insert(old[0], fresh, new[0][~known])
+    return keys, column(old[1], new[1]), column(old[2], new[2]), column(old[3], new[3])
 
 
 def _summed(keys: IntArray, sums: FloatArray, counts: IntArray, towards: FloatArray) -> Columns:

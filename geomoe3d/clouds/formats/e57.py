@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -49,17 +49,7 @@ def read_e57(path: Path) -> RawCloud:
         FormatError: no E57 file, truncated, or damaged.
         DependencyError: pye57 is absent.
     """
-    pye57 = require_pye57()
-    _check_size(path)
-    try:
-        with pye57.E57(str(path)) as file:
-            scans = [_read_scan(pye57.libe57, file, index) for index in range(file.scan_count)]
-    except FormatError:
-        raise
-    except Exception as error:
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise FormatError(f"'{path}' is no E57 file or damaged: {reason[0]}") from None
-    scans = [scan for scan in scans if len(scan.points)]
+    scans = list(read_scans(path))
     if not scans:
         return RawCloud(np.empty((0, 3)))
     unread: list[str] = []
@@ -81,6 +71,27 @@ def read_e57(path: Path) -> RawCloud:
         unread=(*dict.fromkeys(name for scan in scans for name in scan.unread), *unread),
         sensor=scans[0].sensor if len(scans) == 1 else None,
     )
+
+
+def read_scans(path: Path) -> Iterator[RawCloud]:
+    """The scans of a file that hold points, one by one, each moved by its pose, ``sensor`` being its place.
+
+    Raises:
+        FormatError, DependencyError: as `read_e57`, in the course of reading.
+    """
+    pye57 = require_pye57()
+    _check_size(path)
+    try:
+        with pye57.E57(str(path)) as file:
+            for index in range(file.scan_count):
+                scan = _read_scan(pye57.libe57, file, index)
+                if len(scan.points):
+                    yield scan
+    except FormatError:
+        raise
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise FormatError(f"'{path}' is no E57 file or damaged: {reason[0]}") from None
 
 
 def _check_size(path: Path) -> None:

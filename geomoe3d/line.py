@@ -16,8 +16,8 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import bounded_voxel_size, own_voxel_sizes, round_size
-from geomoe3d.clouds.viewpoint import MOST_SIGN_BREAKS, find_viewpoints, known_viewpoints, sign_breaks
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints, sign_breaks
+from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
@@ -34,10 +34,6 @@ from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
 from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, PointCloud
-
-_LARGER = 3.0
-"""Ratio of the voxel sizes that two clouds would get by themselves from which the larger is taken for a map; of 1,941
-pairs of scans measured the largest was 2.6, of a depth camera's view in its room three to four."""
 
 
 class Look(NamedTuple):
@@ -235,8 +231,8 @@ class Line:
             return
         if places is None:
             yield "flipped"
-        automatic = self.config.preparation.viewpoint == "auto"
-        if automatic and (places is None or max(map(sign_breaks, prepared)) > MOST_SIGN_BREAKS):
+        automatic, most = self.config.preparation.viewpoint == "auto", expert().viewpoint.most_sign_breaks
+        if automatic and (places is None or max(map(sign_breaks, prepared)) > most):
             yield "centroid"
 
     def _finished(self, look: Look, clouds: tuple[PointCloud, PointCloud]) -> Explanation:
@@ -259,7 +255,7 @@ class Line:
 
     def _is_map(self, sizes: tuple[float, float]) -> bool:
         """Whether one cloud is so much larger or sparser than the other that what both share is a small part of it."""
-        return self.again is not None and max(sizes) >= _LARGER * min(sizes)
+        return self.again is not None and max(sizes) >= expert().maps.larger_grid * min(sizes)
 
     def _in_map(self, clouds: tuple[PointCloud, PointCloud], guess: FloatArray | None) -> Explanation:
         """The first cloud sought in the second, much larger one."""

@@ -9,11 +9,12 @@ import pytest
 from generated_buildings import GRID, first_room, other_room, scanned, view
 
 import geomoe3d
-from geomoe3d import Map, line
+from geomoe3d import Map
 from geomoe3d.cli.errors import BAD_INPUT, OK, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.raw import RawCloud
+from geomoe3d.config import load_config
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
 from geomoe3d.features.base import with_features
 from geomoe3d.features.learned import LearnedDescriptor
@@ -361,10 +362,10 @@ def test_of_an_e57_each_scan_is_read_with_its_sensor(tmp_path):
 # ---- register ------------------------------------------------------------------------------------------
 
 
-def test_register_seeks_the_small_cloud_in_the_large_one_whichever_comes_first(building, scan, monkeypatch):
+def test_register_seeks_the_small_cloud_in_the_large_one_whichever_comes_first(building, scan):
     points, true = scan
-    monkeypatch.setattr(line, "_LARGER", 1.2)  # two rooms are not many
-    back = geomoe3d.register(building, points)
+    config = load_config(None, ["expert.maps.larger_grid=1.2"])  # two rooms are not many
+    back = geomoe3d.register(building, points, config=config)
     assert back.ok
     assert "places" in back.seconds
     assert shift(back.inverse().T_target_source, true) < 0.05

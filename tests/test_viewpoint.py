@@ -9,13 +9,12 @@ from surface_pairs import corner
 
 from geomoe3d.clouds.prepare import orient_normals, prepare
 from geomoe3d.clouds.viewpoint import (
-    MOST_SIGN_BREAKS,
     believed_viewpoints,
     find_viewpoints,
     guess_viewpoint,
     sign_breaks,
 )
-from geomoe3d.config import PreparationConfig, load_config
+from geomoe3d.config import PreparationConfig, expert, load_config
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_points
 from geomoe3d.registration import Registrar
 from geomoe3d.types import PointCloud
@@ -156,10 +155,10 @@ def test_normals_contradict_a_sensor_that_saw_around_a_body_but_not_the_one_that
     front = points[np.einsum("ij,ij->i", sensor - points, normals) > 0]
     config, elsewhere = PreparationConfig(), np.array([0.0, -0.5, -1.0])
     seen = prepare(PointCloud(front), 0.06, config, viewpoint=sensor)
-    assert sign_breaks(seen) < 0.2 * MOST_SIGN_BREAKS
+    assert sign_breaks(seen) < 0.2 * expert().viewpoint.most_sign_breaks
     for cloud in (front, points):
         doubted = prepare(PointCloud(cloud), 0.06, config, viewpoint=elsewhere)
-        assert sign_breaks(doubted) > MOST_SIGN_BREAKS
+        assert sign_breaks(doubted) > expert().viewpoint.most_sign_breaks
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -36,6 +36,7 @@ from geomoe3d.clouds.formats.others import MEANT
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import READERS, take_inherited
 from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.config import expert
 from geomoe3d.errors import (
     EmptyCloudError,
     ForbiddenFileError,
@@ -47,9 +48,6 @@ from geomoe3d.errors import (
 from geomoe3d.geometry.columns import finite_rows
 from geomoe3d.runtime.home import ensure_home
 from geomoe3d.types import FloatArray, PointCloud
-
-MAX_COORDINATE = 1e12
-DENSE_MESH_VERTICES = 50_000
 
 READABLE_SUFFIXES = tuple(READERS)
 
@@ -146,7 +144,7 @@ def is_sampled(data: Any, raw: RawCloud) -> bool:
     if raw.faces is None:
         return False
     is_scan = _is_path(data) and Path(str(data).lower().removesuffix(".gz")).suffix in (".ply", ".vtk")
-    return not (is_scan and len(raw.points) >= DENSE_MESH_VERTICES)
+    return not (is_scan and len(raw.points) >= expert().loading.dense_mesh)
 
 
 def read_raw(data: Any) -> RawCloud:
@@ -254,7 +252,7 @@ def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
     Raises:
         EmptyCloudError: no points at all.
         NonFiniteError: no finite point.
-        InputError: a finite coordinate beyond `MAX_COORDINATE`.
+        InputError: a finite coordinate beyond `expert.loading.most_coordinate`.
     """
     num_points = len(raw.points)
     if not num_points:
@@ -266,11 +264,12 @@ def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
     if num_non_finite:
         raw = raw.take(finite) if raw.faces is None else meshes.without_vertices(raw, finite)
     largest = max(float(raw.points.max()), -float(raw.points.min()))
-    if largest > MAX_COORDINATE:
-        row = int(np.argmax(np.abs(raw.points).max(axis=1) > MAX_COORDINATE))
+    limit = expert().loading.most_coordinate
+    if largest > limit:
+        row = int(np.argmax(np.abs(raw.points).max(axis=1) > limit))
         raise InputError(
             f"{what}: finite point {row} is at {raw.points[row].tolist()}, beyond the limit of "
-            f"{MAX_COORDINATE:g}; remove such points (they often stand for missing measurements) or use a "
+            f"{limit:g}; remove such points (they often stand for missing measurements) or use a "
             "larger unit"
         )
     return raw, num_non_finite

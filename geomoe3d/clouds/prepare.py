@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomoe3d.clouds.viewpoint import guess_viewpoint
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.columns import extents, largest_of_rows
 from geomoe3d.geometry.draws import OFF_ROUND, mixed
@@ -18,12 +18,8 @@ from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.threads import each, usable_threads
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
-_AUTO_SAMPLE = 100_000  # points looked at when a voxel size is chosen: density is known well enough by then
 _MIN_POINTS = 3
-_MAX_EXTENT_RATIO = 50
-_RAMP, _AT_WALL, _LEAST_HELD, _FULL = 0.05, 1e-3, 0.01, 0.1
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
-_SPACING_POINTS = 20_000
 _BITS = 21  # of a 64-bit voxel key, for each axis
 # Whether points fill space: how many are looked at, within how many voxels, with how many neighbours at least; how many
 # are asked, and the variation from which they do: few at first.
@@ -139,7 +135,7 @@ def check_cloud(cloud: PointCloud) -> None:
 
 def robust_extent(points: FloatArray) -> float:
     """Diagonal of the box that holds the central 98 % along each axis: stray points do not count."""
-    sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
+    sample = points[:: max(1, len(points) // expert().preparation.extent_sample)]
     low, high = np.percentile(sample, [1, 99], axis=0)
     extent = float(np.linalg.norm(high - low))
     return extent if extent > 0 else float(np.linalg.norm(extents(points)))
@@ -165,11 +161,12 @@ def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
     """
     extents = [robust_extent(cloud.points) for cloud in (source, target)]
     small, large = sorted(extents)
-    if small <= 0 or large / small < _MAX_EXTENT_RATIO:
+    most = expert().preparation.most_extent_ratio
+    if small <= 0 or large / small < most:
         return None
     return (
         f"the extents differ by a factor of {large / small:.0f} ('{source.name}' {extents[0]:.4g}, "
-        f"'{target.name}' {extents[1]:.4g}; at most {_MAX_EXTENT_RATIO} is taken): one is probably in "
+        f"'{target.name}' {extents[1]:.4g}; at most {most} is taken): one is probably in "
         "millimetres and the other in metres; bring both to one unit, a rigid transform cannot change scale"
     )
 
@@ -181,14 +178,14 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     search that stops when it is close enough would end elsewhere when one point moves to another voxel. For the same
     reason a voxel that holds next to nothing counts in part.
     """
-    sample = points[:: max(1, len(points) // _AUTO_SAMPLE)]
+    sample = points[:: max(1, len(points) // expert().preparation.extent_sample)]
     extent = robust_extent(points)
     # A small cloud cannot fill the voxels asked for; half its points is what a grid can still even out.
     goal = min(num_points, max(len(sample) // 2, 1))
 
     def count(step: int) -> float:
         weights, _, starts = _by_voxel(sample, 2.0 ** (step / 2))
-        return float(np.minimum(np.add.reduceat(weights, starts) / _FULL, 1).sum())
+        return float(np.minimum(np.add.reduceat(weights, starts) / expert().preparation.full, 1).sum())
 
     coarsest = int(np.ceil(2 * np.log2(extent)))
     step = min(round(2 * np.log2(extent / np.sqrt(goal))), coarsest)
@@ -242,10 +239,11 @@ def typical_spacing(points: FloatArray) -> float:
 
     # All points of a part keep their density; a thinned cloud would look sparser than it is.
     away = largest_of_rows(np.abs(points - np.median(points[:: max(1, len(points) // 20_000)], axis=0)))
-    if len(points) > _SPACING_POINTS:
-        away_limit = np.partition(away, _SPACING_POINTS)[_SPACING_POINTS]
+    sample = expert().preparation.spacing_sample
+    if len(points) > sample:
+        away_limit = np.partition(away, sample)[sample]
         central = np.flatnonzero(away <= away_limit)
-        asked = mixed(central.astype(np.uint64)) % np.uint64(_SPACING_POINTS // 2000) == 0
+        asked = mixed(central.astype(np.uint64)) % np.uint64(sample // 2000) == 0
         points, queries = points[central], points[central[asked]]
     else:
         queries = points[:: max(1, len(points) // 2000)]
@@ -307,7 +305,7 @@ def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
     weights, order, starts = _by_voxel(points, voxel_size)
     sums = np.add.reduceat(weights, starts)
     means: FloatArray = np.add.reduceat(points[order] * weights[:, None], starts, axis=0) / sums[:, None]
-    kept = sums >= _LEAST_HELD
+    kept = sums >= expert().preparation.least_held
     thin = np.flatnonzero(~kept)
     if not kept.any():
         return means
@@ -327,7 +325,8 @@ def _by_voxel(points: FloatArray, voxel_size: float) -> tuple[FloatArray, IntArr
         place = column / voxel_size - OFF_ROUND
         place -= np.floor(place) + 0.5
         np.minimum(inside, 0.5 - np.abs(place, out=place), out=inside)
-    return np.clip(inside[order] / _RAMP, _AT_WALL, 1), order, starts
+    known = expert().preparation
+    return np.clip(inside[order] / known.ramp, known.at_wall, 1), order, starts
 
 
 def drop_isolated(points: FloatArray, radius: float) -> FloatArray:

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.types import FloatArray
-
-NEAR_ZERO_SPREADS = 10.0
 
 
 def choose_origin(points: FloatArray) -> FloatArray:
@@ -34,7 +33,7 @@ def choose_origin(points: FloatArray) -> FloatArray:
         (3,) whole numbers.
     """
     median, spread = _median_and_spread(points)
-    if float(np.abs(median).max()) <= NEAR_ZERO_SPREADS * spread:
+    if float(np.abs(median).max()) <= expert().loading.near_zero * spread:
         return np.zeros(3)
     origin: FloatArray = np.floor(median + 0.5)
     return origin + 0.0  # no negative zeros

@@ -8,24 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.columns import bounds
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import BoolArray, FloatArray, PointCloud, PreparedCloud
-
-# How near the origin, in extents, the mean, the middle of the box and the lowest corner come only where a
-# cloud was moved. Of depth-camera fragments the nearest were 0.36, 0.42 and 0.37, of laser scans in rooms
-# 0.037, 0.022 and 0.22; of fragments centred and then thinned by a grid, 99 of 100 had the mean within 0.03.
-_LEAST_MEAN, _LEAST_MIDDLE, _LEAST_CORNER = 0.025, 0.01, 0.05
-# Neighbours on a smooth surface turned to opposite sides: of fragments of rooms, scans and frames 0.1 to 2.5 %
-# (median 0.7), of object scans and meshes whose origin was no sensor 1.5 to 4.6 %, and 3 % in one cloud of any pair.
-MOST_SIGN_BREAKS = 0.025
-_PIXEL_DEG = 3.0
-_NUM_CANDIDATES = 200
-_NUM_KEPT = 4
-_NUM_POINTS = 1500
-_MARGIN_VOXELS = 4.0
-_LEAST_VISIBLE = 0.85  # below it the cloud was seen from several sides
-_GRAZING_COSINE = 0.2  # surfaces seen flatter than this return few points to a real sensor
 
 
 def find_viewpoints(
@@ -91,7 +77,9 @@ def _sensor_may_be_at_origin(cloud: PointCloud) -> bool:
     if not _is_near(np.zeros(3), low, high):
         return False
     mean = cloud.points.mean(axis=0) + cloud.origin
-    moved = (mean, _LEAST_MEAN), ((low + high) / 2, _LEAST_MIDDLE), (low, _LEAST_CORNER)
+    known = expert().viewpoint
+    middle = (low + high) / 2
+    moved = (mean, known.moved_mean), (middle, known.moved_middle), (low, known.moved_corner)
     return all(float(np.linalg.norm(place)) >= least * extent for place, least in moved)
 
 
@@ -121,15 +109,16 @@ def guess_viewpoint(
         voxel_size: edge of the grid; points four of it farther than another in the same direction count as hidden.
         seed: decides places and points looked at.
     """
-    margin, rng = _MARGIN_VOXELS * voxel_size, np.random.default_rng(seed)
-    chosen = drawn_rows(points, voxel_size, _NUM_POINTS, seed)
+    known = expert().viewpoint
+    margin, rng = known.margin * voxel_size, np.random.default_rng(seed)
+    chosen = drawn_rows(points, voxel_size, known.num_points, seed)
     points, normals = points[chosen], normals[chosen]
     low, high = bounds(points)
     half = (high - low) / 2
     step = 0.15 * float(np.linalg.norm(half))
-    places = (low + high) / 2 + rng.uniform(-1, 1, (_NUM_CANDIDATES, 3)) * (1.3 * half + step)
+    places = (low + high) / 2 + rng.uniform(-1, 1, (known.num_candidates, 3)) * (1.3 * half + step)
     scores = np.array([_plausibility(place, points, normals, margin) for place in places])
-    order = np.argsort(-scores, kind="stable")[:_NUM_KEPT]
+    order = np.argsort(-scores, kind="stable")[: known.num_kept]
     best, best_scores = places[order], scores[order]
     for _ in range(4):
         for k in range(len(best)):
@@ -140,14 +129,15 @@ def guess_viewpoint(
         step /= 1.7
     found: FloatArray = best[best_scores.argmax()]
     directions, distance, _ = _view(found, points, normals)
-    return found if _not_hidden(directions, distance, margin).mean() >= _LEAST_VISIBLE else None
+    visible = _not_hidden(directions, distance, margin).mean()
+    return found if visible >= known.least_visible else None
 
 
 def _plausibility(place: FloatArray, points: FloatArray, normals: FloatArray, margin: float) -> float:
     """Share of points not hidden, plus mean |cosine| of incidence, minus the share at a grazing angle."""
     directions, distance, cosine = _view(place, points, normals)
     visible = _not_hidden(directions, distance, margin)
-    return float(visible.mean() + cosine.mean() - (cosine < _GRAZING_COSINE).mean())
+    return float(visible.mean() + cosine.mean() - (cosine < expert().viewpoint.grazing_cosine).mean())
 
 
 def _view(
@@ -162,7 +152,7 @@ def _view(
 
 def _not_hidden(directions: FloatArray, distance: FloatArray, margin: float) -> BoolArray:
     """True where no point in the same pixel of a cube map around the place is nearer by ``margin``."""
-    size = round(90 / _PIXEL_DEG)
+    size = round(90 / expert().viewpoint.pixel_deg)
     axis = np.abs(directions).argmax(1)
     rows = np.arange(len(directions))
     major = directions[rows, axis]

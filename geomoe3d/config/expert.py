@@ -14,6 +14,7 @@ from contextvars import ContextVar
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
+from geomoe3d.config.expert_clouds import LoadingExpert, PreparationExpert, ViewpointExpert
 from geomoe3d.config.expert_decision import (
     AccuracyExpert,
     CausesExpert,
@@ -23,6 +24,7 @@ from geomoe3d.config.expert_decision import (
     SharedSurfaceExpert,
     SimilarityExpert,
 )
+from geomoe3d.config.expert_maps import LocatingExpert, MapsExpert, PlacesExpert
 from geomoe3d.config.expert_proposing import (
     CorrespondencesExpert,
     FeaturesExpert,
@@ -57,6 +59,12 @@ class ExpertConfig(Section):
     surfaces: SurfacesExpert = SurfacesExpert()
     network: NetworkExpert = NetworkExpert()
     alignment: AlignmentExpert = AlignmentExpert()
+    maps: MapsExpert = MapsExpert()
+    places: PlacesExpert = PlacesExpert()
+    locating: LocatingExpert = LocatingExpert()
+    loading: LoadingExpert = LoadingExpert()
+    preparation: PreparationExpert = PreparationExpert()
+    viewpoint: ViewpointExpert = ViewpointExpert()
 
 
 _IN_FORCE: ContextVar[ExpertConfig] = ContextVar("expert constants in force")

@@ -33,7 +33,12 @@ DEFAULT_MAX_BYTES = 4 * 2**30
 _SUFFIX = ".described.npz"
 _PREPARED_BY = "geomoe3d.clouds.prepare"
 _ABANDONED_SECONDS = 3600.0
-_CONSTANTS = ("features",)  # sections of `expert` that decide a cloud with features
+_CONSTANTS = (
+    "loading",
+    "preparation",
+    "viewpoint",
+    "features",
+)  # sections of `expert` that decide it
 _COUNTS = ("num_input", "num_non_finite", "num_duplicates", "num_isolated")
 
 

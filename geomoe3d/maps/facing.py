@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import Float32Array, FloatArray
 
-_NEIGHBORS = 10
 _BINS = 11  # of each of the three histograms of an FPFH
 
 
@@ -23,7 +23,7 @@ def facing_alike(points: FloatArray, normals: FloatArray) -> FloatArray:
     from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
     from scipy.spatial import cKDTree
 
-    n, k = len(points), min(_NEIGHBORS, len(points) - 1)
+    n, k = len(points), min(expert().maps.facing_neighbors, len(points) - 1)
     _, near = cKDTree(points).query(points, k=k + 1, workers=usable_threads())
     rows, columns = np.repeat(np.arange(n), k), np.asarray(near)[:, 1:].ravel()
     cosine = np.einsum("ij,ij->i", normals[rows], normals[columns])

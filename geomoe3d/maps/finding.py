@@ -14,6 +14,7 @@ import numpy as np
 
 from geomoe3d.clouds.prepare import bounded_voxel_size, choose_voxel_size, prepare
 from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.config import expert
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.se3 import motions_apart, shift_frames, transform_points
@@ -24,9 +25,6 @@ from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-FINER = 1.3
-"""A level whose voxels are so many times smaller than the scan's own serves it."""
-_LEAST_VOXELS = 600  # that a scan fills on a level that serves it
 Look = Literal["quick", "more", "finer"]
 """At the likeliest windows; at more of them with more matches; around what was found, on the scan's own grid."""
 
@@ -108,8 +106,8 @@ class Finder:
         own = given or choose_voxel_size(cloud, cloud, preparation.voxel_points)
         own = bounded_voxel_size(cloud, cloud, own, preparation.max_points)
         if given is not None:
-            return own, FINER * own
-        return own, max(own, choose_voxel_size(cloud, cloud, _LEAST_VOXELS))
+            return own, expert().maps.finer * own
+        return own, max(own, choose_voxel_size(cloud, cloud, expert().maps.least_voxels))
 
     def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
         """The search for a scan on a level."""
@@ -129,7 +127,7 @@ class Finder:
 
     def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
         """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
-        if search.level.voxel_size <= FINER * size or not motions:
+        if search.level.voxel_size <= expert().maps.finer * size or not motions:
             return None
         centers = [transform_points(T, search.center[None])[0] for T in motions]
         around = self.voxels.within(np.array(centers), 2 * search.reach)

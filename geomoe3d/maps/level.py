@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.clouds.prepare import drop_isolated, estimate_normals, orient_normals, voxel_means
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.features.base import Descriptor, with_features
 from geomoe3d.features.fpfh import FpfhDescriptor
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 Float16Array = NDArray[np.float16]
 SPACING = 2  # voxels between the points that are compared: an inlier may be two voxels off
-_KNOWN = 0.1  # length of a mean direction to the sensors below which they saw a surface from everywhere
-_LEAST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +84,9 @@ class Level:
         means = voxels.points
         points = means if voxel_size <= voxels.edge else voxel_means(means, voxel_size)
         points = drop_isolated(points, radius)
-        if len(points) < _LEAST:
+        if len(points) < (least := expert().maps.least_points):
             raise EmptyCloudError(
-                f"{len(points)} points of the map remain on a {voxel_size:.4g} grid, at least {_LEAST} are needed; "
+                f"{len(points)} points of the map remain on a {voxel_size:.4g} grid, at least {least} are needed; "
                 "give a denser map or a voxel size that fits it"
             )
         normals = estimate_normals(points, radius, config.normal_neighbors)
@@ -162,6 +160,6 @@ def _turned(points: FloatArray, normals: FloatArray, voxels: VoxelSums) -> tuple
     _, nearest = cKDTree(voxels.points).query(points)
     towards = voxels.towards[nearest] / voxels.counts[nearest, None]
     height = np.einsum("ij,ij->i", normals, towards)
-    known: BoolArray = np.abs(height) > _KNOWN
+    known: BoolArray = np.abs(height) > expert().maps.known
     turned = normals * np.where(height < 0, -1.0, 1.0)[:, None]
     return turned, known

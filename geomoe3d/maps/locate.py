@@ -15,7 +15,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import judge, lead_over
@@ -28,21 +28,6 @@ from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
-
-_FIRST_WINDOWS, _WINDOWS, _MORE_WINDOWS = 6, 12, 24
-_PLAIN = 0.65  # a quick score that hardly any wrong motion reaches: no more windows are looked into
-_KEPT, _POLISHED = 12, 8  # distinct candidates, and how many of them are drawn closer
-_POLISHING = (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)  # voxels within which points are matched, step by step
-_PER_WINDOW = 6
-_ASKED, _ASKED_BACK = 400, 800
-_LEAST_COSINE = 0.7
-_VIOLATION_WEIGHT = 10.0
-_DISTINCT_THRESHOLDS, _MOST_TURN_DEG = 3.0, 15.0  # as in `geomoe3d.decision.selection`
-_CLOSE = 0.75  # of the best candidate's quick score: such places are looked at too
-_JOINED = (
-    1.35  # standard deviation of the measured scales of 57 right answers in maps, in deviations of a pair
-)
-_MARGIN = 6.0  # voxels around the scan that are cut out of the map with it: a feature's radius and what it may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +78,14 @@ class Search:
         self.eye = self.center if scan.viewpoint is None else scan.viewpoint
         reach = np.linalg.norm(scan.points - self.center, axis=1)
         self.reach = float(np.quantile(reach, 0.98))
-        self._apart = _DISTINCT_THRESHOLDS * self.config.estimator.inlier_threshold * scan.voxel_size
-        margin = _MARGIN * scan.voxel_size
+        threshold = self.config.estimator.inlier_threshold * scan.voxel_size
+        self._apart = expert().selection.different_shift * threshold
+        margin = expert().locating.margin * scan.voxel_size
         self._box = scan.points.min(0) - margin, scan.points.max(0) + margin
         clock("places")
         self._query = Query(compared, level, seed=self.config.seed)
         rng = np.random.default_rng(self.config.seed)
-        self._rows = np.sort(rng.permutation(len(scan))[:_ASKED])
+        self._rows = np.sort(rng.permutation(len(scan))[: expert().locating.asked])
         self._order = rng.permutation(len(level.points))
         self._view = None if scan.viewpoint is None else RangeImage.of(scan.points, scan.viewpoint)
 
@@ -120,26 +106,27 @@ class Search:
         """
         self._clock("places")
         within = None if near is None else (near[0], near[1] + float(np.linalg.norm(self.eye - self.center)))
-        windows = self._query.windows(_MORE_WINDOWS if more else _WINDOWS, within)
+        known = expert().locating
+        windows = self._query.windows(known.more_windows if more else known.windows, within)
         self._clock("propose")
         scored = [(self._quick(T), Hypothesis(T)) for T in given]
         # What was known before did not convince, or it would not be asked again.
-        plain = max([_PLAIN, *(1.05 * score for score, _ in scored)]) if more else _PLAIN
+        plain = max([known.plain, *(1.05 * score for score, _ in scored)]) if more else known.plain
         for number, window in enumerate(windows):
-            if number >= _FIRST_WINDOWS and max((q for q, _ in scored), default=0.0) > plain:
+            if number >= known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
                 break
-            proposed = self._query.motions(window, _PER_WINDOW, more=more)
+            proposed = self._query.motions(window, known.per_window, more=more)
             if near is not None:
                 proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
             scored += [(self._quick(h.T_target_source), h) for h in proposed]
         scored.sort(key=lambda item: -item[0])
         chosen: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in scored:
-            if len(chosen) == _KEPT:
+            if len(chosen) == known.kept:
                 break
             if all(self.differ(hypothesis, other) for _, other in chosen):
                 chosen.append((score, hypothesis))
-        polished = [Hypothesis(self._polished(h.T_target_source)) for _, h in chosen[:_POLISHED]]
+        polished = [Hypothesis(self._polished(h.T_target_source)) for _, h in chosen[: known.polished]]
         both = [*chosen, *((self._quick(h.T_target_source), h) for h in polished)]
         best: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in sorted(both, key=lambda item: -item[0]):
@@ -150,7 +137,7 @@ class Search:
     def differ(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two motions are clearly different."""
         shift, turn = motions_apart(a.T_target_source, b.T_target_source, self.center)
-        return shift > self._apart or turn > _MOST_TURN_DEG
+        return shift > self._apart or turn > expert().selection.different_turn_deg
 
     def look(self, hypothesis: Hypothesis, *, fully: bool = False) -> Found:
         """The ordinary line on the scan and the map around where a motion puts it.
@@ -200,7 +187,7 @@ class Search:
         T, pair = decision.T_target_source, best.pair
         scale = measure_scale(T, *pair.clouds)
         if scale is not None:  # maps are bent where their scans were joined
-            scale = replace(scale, sigma=_JOINED * scale.sigma)
+            scale = replace(scale, sigma=expert().locating.scale_deviation * scale.sigma)
         decision = decision.with_scale(scale)
         told = measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold)
         return Found(pair, replace(decision, accuracy=told), sure), distinct
@@ -214,13 +201,13 @@ class Search:
 
         level = self.level
         points, normals = self.scan.points[self._rows], self.scan.normals[self._rows]
-        for reach in _POLISHING:
+        for reach in expert().locating.polishing:
             moved = transform_points(T, points)
             distance, nearest = level.tree.query(moved, distance_upper_bound=reach * level.voxel_size)
             hit = np.flatnonzero(np.isfinite(distance))
             there = level.normals[np.asarray(nearest)[hit]]
             hit_normals = normals[hit] @ T[:3, :3].T
-            alike = np.abs(np.einsum("ij,ij->i", hit_normals, there)) > _LEAST_COSINE
+            alike = np.abs(np.einsum("ij,ij->i", hit_normals, there)) > expert().surfaces.least_cosine
             hit, there = hit[alike], there[alike]
             if len(hit) < 6:
                 return T
@@ -241,23 +228,23 @@ class Search:
         hit = np.isfinite(distance)
         normals = self.scan.normals[self._rows][hit] @ T[:3, :3].T
         cosine = np.abs(np.einsum("ij,ij->i", normals, level.normals[np.asarray(nearest)[hit]]))
-        agreement = float((cosine > _LEAST_COSINE).sum() / len(moved))
+        agreement = float((cosine > expert().surfaces.least_cosine).sum() / len(moved))
         if self._view is None or not hit.any():
             return agreement
         around = np.array(level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach))
-        around = around[np.argsort(self._order[around])[:_ASKED_BACK]]
+        around = around[np.argsort(self._order[around])[: expert().locating.asked_back]]
         if not len(around):
             return 0.0
         seen, margin = self._view.margins(transform_points(inverse(T), level.points[around]))
         violation = float((margin < -4 * voxel).sum() / (seen.sum() + 0.05 * len(around)))
-        return agreement * float(np.exp(-_VIOLATION_WEIGHT * violation))
+        return agreement * float(np.exp(-expert().surfaces.violation_weight * violation))
 
     def _around(self, T: FloatArray, fully: bool) -> PreparedCloud:
         """What the map holds within the scan's box, as seen from where the motion puts the scan's sensor."""
         level = self.level
         center, eye = transform_points(T, np.stack([self.center, self.eye]))
         near = level.tree.query_ball_point(
-            center, self.reach + _MARGIN * level.voxel_size, return_sorted=True
+            center, self.reach + expert().locating.margin * level.voxel_size, return_sorted=True
         )
         rows = np.array(near, dtype=np.int64)
         there = transform_points(inverse(T), level.points[rows])
@@ -270,5 +257,5 @@ class Search:
 def likely(candidates: Sequence[tuple[float, Hypothesis]], most: int) -> Iterator[Hypothesis]:
     """The best candidate, and those that come near it, at most so many."""
     for score, hypothesis in candidates[:most]:
-        if score >= _CLOSE * candidates[0][0]:
+        if score >= expert().locating.close * candidates[0][0]:
             yield hypothesis

@@ -20,11 +20,11 @@ from geomoe3d.clouds.prepare import (
     typical_spacing,
 )
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.config import RegistrationConfig, build_config, expert_in_force
+from geomoe3d.config import RegistrationConfig, build_config, expert, expert_in_force
 from geomoe3d.decision.answer import failed_result, finished_result
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
-from geomoe3d.maps.finding import FINER, Finder
+from geomoe3d.maps.finding import Finder
 from geomoe3d.maps.level import Level
 from geomoe3d.maps.locate import Found
 from geomoe3d.maps.location import Location, Place
@@ -35,15 +35,8 @@ from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, PointCloud
 
-_MOST_VOXELS = 4_000_000
-# The grid on which a map is described before any scan is known: at least so many points, where it holds them, and one
-# of twenty of its own.
-_USUAL_POINTS, _USUAL_SHARE = 150_000, 20
-_MOST_POINTS = 1_000_000  # of any grid: 50 s of processor time, and 150 MB
 _PIECE = 1_000_000
-_CANDIDATES = 4
 NOWHERE = "no place in the map was found at which the scan could lie"
-_LARGER = 3.0  # times the map's extent from which a scan is no part of it
 
 
 class Map:
@@ -168,7 +161,7 @@ class Map:
             if not len(voxels):
                 voxels = _first(moved, read.name, read.origin if T_map_cloud is None else None)
             voxels = voxels.added(moved, place)
-            while len(voxels) > _MOST_VOXELS:
+            while len(voxels) > expert().maps.most_voxels:
                 voxels = voxels.coarser()
             count += len(points)
         name = self.name if self.sources else read.name
@@ -193,7 +186,8 @@ class Map:
             progress("describe")
         wanted = voxel_size or self.config.voxel_size
         if wanted is None:
-            usual = min(max(_USUAL_POINTS, self.num_points // _USUAL_SHARE), _MOST_POINTS)
+            known = expert().maps
+            usual = min(max(known.usual_points, self.num_points // known.usual_share), known.most_points)
             wanted = round_size(max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge))
         self._level(wanted, wanted)
 
@@ -250,7 +244,7 @@ class Map:
         if refused is not None:
             return self._nowhere(cloud, refused, clock)
         local = None if asked is None else (asked[0] - self._voxels.origin, asked[1])
-        best, ranked = self._finder(cloud, scan, guesses, local, max(k, _CANDIDATES), clock)
+        best, ranked = self._finder(cloud, scan, guesses, local, max(k, expert().maps.candidates), clock)
         if best is None or best.decision.answer is None:
             return self._nowhere(cloud, NOWHERE, clock)
         result = finished_result(best.pair, best.decision, self.config, clock.stop())
@@ -274,10 +268,10 @@ class Map:
 
     def _level(self, size: float, coarsest: float) -> Level:
         """The level for a scan that has this grid by itself, at most so coarse; made if there is none."""
-        fitting = [x for x in self._levels if size / FINER <= x.voxel_size <= coarsest]
+        fitting = [x for x in self._levels if size / expert().maps.finer <= x.voxel_size <= coarsest]
         if not fitting:
-            size = max(size, self._voxels.edge, self._voxels.edge_for(_MOST_POINTS))
-            fitting = [x for x in self._levels if size / FINER <= x.voxel_size <= size]
+            size = max(size, self._voxels.edge, self._voxels.edge_for(expert().maps.most_points))
+            fitting = [x for x in self._levels if size / expert().maps.finer <= x.voxel_size <= size]
         if not fitting:
             fitting = [Level.of(self._voxels, size, self.config.preparation)]
             self._levels = tuple(sorted((*self._levels, *fitting), key=_size))
@@ -286,7 +280,7 @@ class Map:
     def _refused(self, cloud: PointCloud) -> str | None:
         """A sentence where scan and map cannot belong together."""
         extents = robust_extent(cloud.points), self._extent
-        if extents[0] > _LARGER * extents[1]:
+        if extents[0] > expert().maps.largest_scan * extents[1]:
             return (
                 f"the scan is larger than the map (extents {extents[0]:.4g} and {extents[1]:.4g}): give them the other "
                 "way round, or bring both to one unit"
@@ -361,4 +355,4 @@ def search_larger(
     nothing = VoxelSums.empty(1.0, np.zeros(3))
     made = Map(nothing, config=line.config, line=line).with_cloud(replace(world, sensor=None))
     guesses = [] if guess is None else [guess]
-    return made._finder(scan, scan, guesses, None, _CANDIDATES, clock)[0]
+    return made._finder(scan, scan, guesses, None, expert().maps.candidates, clock)[0]

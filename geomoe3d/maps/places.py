@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.maps.level import Compared, Level
@@ -25,13 +26,6 @@ from geomoe3d.types import (
     IntArray,
 )
 
-_ASKED = 1000  # points of the scan
-_MATCHES = 500, 1000  # of a window, from which motions are proposed, at first and later
-_THRESHOLD = 3.0  # voxels: what is compared is two apart
-_ESTIMATORS = (
-    ConsensusEstimator(num_hypotheses=6, num_seeds=250, num_refined=30),
-    ConsensusEstimator(num_hypotheses=6, num_seeds=500, num_refined=60),
-)
 _ROWS = 50
 """Points of the scan whose similarities to all of the map are held at once."""
 
@@ -62,7 +56,9 @@ class Query:
 
     def __init__(self, scan: Compared, level: Level, *, seed: int = 0) -> None:
         self.level, self.seed = level, seed
-        self._scan = scan.take(np.sort(np.random.default_rng(seed).permutation(len(scan.points))[:_ASKED]))
+        self._scan = scan.take(
+            np.sort(np.random.default_rng(seed).permutation(len(scan.points))[: expert().places.asked])
+        )
         self.radius = float(np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), 0.95))
 
     @single_blas_thread()
@@ -126,15 +122,19 @@ class Query:
         scan, there = self._scan, self.level.compared.take(window.keys)
         index, distance, _, mutual = nearest_features(scan.features, there.features, 1, False)
         choice, mutual_first = index[:, 0], mutual[:, 0]
-        rows = np.lexsort((distance[:, 0], ~mutual_first))[: _MATCHES[more]]
+        rows = np.lexsort((distance[:, 0], ~mutual_first))[: expert().places.matches[more]]
         columns = choice[rows]
         matched = Correspondences(
             np.hstack([scan.points[rows], there.points[columns]]),
             normals=(scan.normals[rows], there.normals[columns]),
             normals_signed=True,
         )
-        threshold = _THRESHOLD * self.level.voxel_size
-        return _ESTIMATORS[more](
+        threshold = expert().places.threshold * self.level.voxel_size
+        known = expert().places
+        estimate = ConsensusEstimator(
+            num_hypotheses=known.proposed, num_seeds=known.seeds[more], num_refined=known.refined[more]
+        )
+        return estimate(
             matched.points,
             np.where(mutual_first[rows], 1.0, 0.5),
             inlier_threshold=threshold,

@@ -1,0 +1,88 @@
+"""Constants of loading and preparing a cloud."""
+
+from __future__ import annotations
+
+from geomoe3d.config.section import Section, constant
+
+
+class LoadingExpert(Section):
+    """What becomes of a file's points (`clouds/loading.py`, `clouds/recentre.py`)."""
+
+    most_coordinate: float = constant(
+        1000000000000.0, "cloud units", (1.0, 1e15), "beyond which a coordinate is an error"
+    )
+    dense_mesh: int = constant(
+        50_000, "vertices", (1, 1_000_000_000), "of a mesh from which they are taken as they are, not sampled"
+    )
+    near_zero: float = constant(
+        10.0, "spreads", (0.1, 1000), "of a cloud within which its median lies near zero"
+    )
+
+
+class PreparationExpert(Section):
+    """From points to a grid (`clouds/prepare.py`)."""
+
+    extent_sample: int = constant(
+        100_000,
+        "points",
+        (100, 100_000_000),
+        "looked at when a voxel size is chosen: density is known well enough by then",
+    )
+    spacing_sample: int = constant(
+        20_000, "points", (2000, 100_000_000), "nearest to the middle, of which the spacing is measured"
+    )
+    most_extent_ratio: int = constant(
+        50, "ratio", (2, 1_000_000), "of two clouds' extents; beyond it one is in another unit"
+    )
+    ramp: float = constant(
+        0.05, "voxels", (1e-06, 0.5), "from a voxel's wall within which a point counts less"
+    )
+    at_wall: float = constant(0.001, "-", (1e-09, 1), "what a point on a voxel's wall counts")
+    least_held: float = constant(0.01, "points", (0, 1), "that a voxel must hold by these weights")
+    full: float = constant(
+        0.1, "points", (1e-06, 1), "by these weights from which a voxel counts fully when voxels are counted"
+    )
+
+
+class ViewpointExpert(Section):
+    """Where a sensor stood (`clouds/viewpoint.py`)."""
+
+    moved_mean: float = constant(
+        0.025,
+        "extents",
+        (0, 1),
+        "from the origin to the mean: nearer only where a cloud was moved there",
+        "depth-camera fragments 0.36 at least, laser scans in rooms 0.037; of centred fragments 99 of 100 within 0.03",
+    )
+    moved_middle: float = constant(
+        0.01,
+        "extents",
+        (0, 1),
+        "from the origin to the middle of the box, likewise",
+        "fragments 0.42 at least, laser scans in rooms 0.022",
+    )
+    moved_corner: float = constant(
+        0.05,
+        "extents",
+        (0, 1),
+        "from the origin to the lowest corner, likewise",
+        "fragments 0.37 at least, laser scans in rooms 0.22",
+    )
+    most_sign_breaks: float = constant(
+        0.025,
+        "share",
+        (0, 1),
+        "of neighbours on a smooth surface that are turned to opposite sides",
+        "scans 0.1 to 2.5 %, objects 1.5 to 4.6 %, and 3 % in one cloud of any pair of them",
+    )
+    pixel_deg: float = constant(3.0, "degrees", (0.1, 45), "pixels in which visibility is asked")
+    num_candidates: int = constant(200, "places", (1, 100_000), "tried for a sensor that is not known")
+    num_kept: int = constant(4, "places", (1, 1000), "that are improved")
+    num_points: int = constant(1500, "points", (10, 1_000_000), "whose visibility is asked")
+    margin: float = constant(
+        4.0, "voxels", (0, 100), "behind the nearest surface within which a point is visible"
+    )
+    least_visible: float = constant(0.85, "share", (0, 1), "below it the cloud was seen from several sides")
+    grazing_cosine: float = constant(
+        0.2, "cosine", (0, 1), "surfaces seen flatter than this return few points to a real sensor"
+    )

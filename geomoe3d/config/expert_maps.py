@@ -1,0 +1,117 @@
+"""Constants of finding a scan in a map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from geomoe3d.config.section import Section, constant
+
+
+class MapsExpert(Section):
+    """What a map keeps, and on which grids a scan is sought (`maps/map.py`, `maps/finding.py`, `maps/level.py`)."""
+
+    larger_grid: float = constant(
+        3.0,
+        "ratio",
+        (1, 1000),
+        "of the voxel sizes that two clouds would get by themselves from which the larger is taken for a map",
+        "of 1,941 pairs of scans the largest was 2.6, of a depth camera's view in its room three to four",
+    )
+    most_voxels: int = constant(
+        4_000_000, "voxels", (1000, 1_000_000_000), "that a map keeps; of more its grid is made coarser"
+    )
+    usual_points: int = constant(
+        150_000,
+        "points",
+        (100, 100_000_000),
+        "least of the grid on which a map is described before any scan is known",
+    )
+    usual_share: int = constant(
+        20, "-", (1, 10_000), "one of so many of the map's points, where that is more"
+    )
+    most_points: int = constant(
+        1_000_000, "points", (1000, 1_000_000_000), "of any grid: 50 s of processor time, and 150 MB"
+    )
+    candidates: int = constant(4, "places", (1, 1000), "that are compared as pairs of scans are")
+    largest_scan: float = constant(
+        3.0, "ratio", (1, 1000), "of a scan's extent to the map's from which it is no part of it"
+    )
+    finer: float = constant(
+        1.3, "ratio", (1, 10), "a grid whose voxels are so many times smaller than the scan's own serves it"
+    )
+    least_voxels: int = constant(600, "voxels", (10, 1_000_000), "that a scan fills on a grid that serves it")
+    known: float = constant(
+        0.1,
+        "length",
+        (0, 1),
+        "of a mean direction to the sensors below which they saw a surface from everywhere",
+    )
+    least_points: int = constant(3, "points", (3, 1_000_000), "of the map that must remain on a grid")
+    facing_neighbors: int = constant(10, "points", (2, 1000), "along which the signs of normals are carried")
+
+
+class PlacesExpert(Section):
+    """Windows of a map and the transforms proposed in them (`maps/places.py`)."""
+
+    asked: int = constant(1000, "points", (10, 1_000_000), "of the scan that vote")
+    matches: tuple[Annotated[int, Field(ge=3, le=1_000_000)], Annotated[int, Field(ge=3, le=1_000_000)]] = (
+        constant(
+            (500, 1000),
+            "matches",
+            None,
+            "of a window, from which transforms are proposed, at first and later",
+        )
+    )
+    threshold: float = constant(3.0, "voxels", (0.1, 100), "of an inlier: what is compared is two apart")
+    proposed: int = constant(6, "hypotheses", (1, 1000), "that consensus keeps of a window")
+    seeds: tuple[Annotated[int, Field(ge=1, le=100_000)], Annotated[int, Field(ge=1, le=100_000)]] = constant(
+        (250, 500), "matches", None, "that consensus begins with, at first and later"
+    )
+    refined: tuple[Annotated[int, Field(ge=1, le=100_000)], Annotated[int, Field(ge=1, le=100_000)]] = (
+        constant((30, 60), "hypotheses", None, "that consensus refines, at first and later")
+    )
+
+
+class LocatingExpert(Section):
+    """Which places are looked at, and what is said of them (`maps/locate.py`)."""
+
+    first_windows: int = constant(6, "windows", (1, 10_000), "that are looked into in any case")
+    windows: int = constant(12, "windows", (1, 10_000), "that are looked into at first")
+    more_windows: int = constant(
+        24, "windows", (1, 10_000), "that are looked into where the first look is not ok"
+    )
+    plain: float = constant(
+        0.65,
+        "quick score",
+        (0, 10),
+        "that hardly any wrong transform reaches: no more windows are looked into",
+    )
+    kept: int = constant(12, "candidates", (1, 10_000), "that are different")
+    polished: int = constant(8, "candidates", (1, 10_000), "that are drawn closer")
+    polishing: tuple[Annotated[float, Field(ge=0.1, le=100)], ...] = constant(
+        (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0),
+        "voxels",
+        None,
+        "within which points are matched, step by step",
+    )
+    per_window: int = constant(6, "hypotheses", (1, 1000), "taken from a window")
+    asked: int = constant(400, "points", (10, 1_000_000), "of the scan, in a quick look")
+    asked_back: int = constant(800, "points", (10, 1_000_000), "of the map, in a quick look")
+    close: float = constant(
+        0.75, "share", (0, 1), "of the best candidate's quick score: such places are looked at too"
+    )
+    scale_deviation: float = constant(
+        1.35,
+        "-",
+        (0.1, 100),
+        "deviation of a scale measured in a map, in deviations of a pair",
+        "57 right answers in maps",
+    )
+    margin: float = constant(
+        6.0,
+        "voxels",
+        (0, 1000),
+        "around the scan that are cut out of the map with it: a feature's radius and what it may be off",
+    )

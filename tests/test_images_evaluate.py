@@ -144,7 +144,8 @@ def test_poses_of_a_scene_from_the_command_line(room, weights, tmp_path):
     assert done.exception is None, done.exception
     table = json.loads((tmp_path / "out.json").read_text())["summary"]
     assert set(table) == {BASELINE, "ratio test, RANSAC", "ratio test, MAGSAC++", "GeoMoE, RANSAC",
-                          "GeoMoE, MAGSAC++", "GeoMoE, eight-point"}  # fmt: skip
+                          "GeoMoE, MAGSAC++", "GeoMoE and loose ratio test, RANSAC",
+                          "GeoMoE and loose ratio test, MAGSAC++", "GeoMoE, eight-point"}  # fmt: skip
     assert table["ratio test, MAGSAC++"]["auc 20"]["value"] > 75
     assert "ratio test, RANSAC" in done.output
 

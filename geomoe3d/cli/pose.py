@@ -28,9 +28,9 @@ def _shared(estimators: tuple[str, ...]) -> Callable[[Callable[..., Any]], Calla
                              type=click.Choice(("rootsift", "sift", "orb"))),
                 click.option("--keypoints", default=2000, show_default=True, type=click.IntRange(min=8),
                              help="Most per image."),
-                click.option("--matches", type=click.Choice(("distinct", "mutual", "all")),
-                             help="Which nearest neighbours are used; distinct: mutual ones that pass the ratio "
-                             "test. [distinct; all with --weights]"),
+                click.option("--matches", type=click.Choice(("distinct", "loose", "mutual", "all")),
+                             help="Which nearest neighbours go to the estimator: mutual ones that pass the ratio test "
+                             "at 0.8 or, loosely, at 0.95, all mutual ones, or all. [distinct; loose with --weights]"),
                 click.option("--weights", type=click.Path(), help="Network that rejects wrong matches "
                              "(.safetensors, see configs/train/images)."),
                 click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators)),
@@ -72,7 +72,7 @@ def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str 
     rays = np.hstack(
         [c.normalise(matches.pixels[:, 2 * k : 2 * k + 2]) for k, c in enumerate((first, second))]
     )
-    weights, verdict = _weights(given["weights"], rays)
+    weights, verdict = _weights(given, matches, rays)
     result = find_pose(
         matches.pixels, (first, second), weights=weights, estimator=given["estimator"], threshold=given["threshold"],
         seed=given["seed"],
@@ -105,7 +105,7 @@ def homography(context: click.Context, /, **given: Any) -> None:
     rays = np.hstack([
         Camera.guess(*size).normalise(matches.pixels[:, 2 * k : 2 * k + 2]) for k, size in enumerate(sizes)
     ])  # fmt: skip
-    weights, verdict = _weights(given["weights"], rays)
+    weights, verdict = _weights(given, matches, rays)
     result = find_homography(
         matches.pixels, weights=weights, estimator=given["estimator"], threshold=given["threshold"] or THRESHOLD,
         seed=given["seed"],
@@ -123,20 +123,24 @@ def _matches(given: dict[str, Any]) -> tuple[Matches, list[tuple[int, int]]]:
             check_output(given[name], force=given["force"])
     keypoints = [detect(given[name], given["detector"], given["keypoints"]) for name in ("image0", "image1")]
     found = match(*keypoints)
-    which = given["matches"] or ("all" if given["weights"] else "distinct")
-    chosen = {"all": found, "mutual": found.take(found.mutual), "distinct": found.distinct()}[which]
-    return chosen, [one.size for one in keypoints]
+    return found, [one.size for one in keypoints]
 
 
-def _weights(path: str | None, rays: FloatArray) -> tuple[FloatArray | None, Verdict | None]:
-    if path is None:
-        return None, None
+def _weights(given: dict[str, Any], matches: Matches, rays: FloatArray) -> tuple[FloatArray, Verdict | None]:
     import numpy as np
 
+    from geomoe3d.images.features import LOOSE_RATIO
     from geomoe3d.images.network import ImageNetwork
 
-    verdict = ImageNetwork(path)(rays)
-    return np.maximum(np.tanh(verdict.logits), 0.0), verdict
+    which = given["matches"] or ("loose" if given["weights"] else "distinct")
+    chosen = {
+        "all": np.ones(len(matches), dtype=bool), "mutual": matches.mutual, "distinct": matches.distinct(),
+        "loose": matches.distinct(LOOSE_RATIO),
+    }[which]  # fmt: skip
+    if given["weights"] is None:
+        return chosen.astype(np.float64), None
+    verdict = ImageNetwork(given["weights"])(rays)
+    return chosen * np.maximum(np.tanh(verdict.logits), 0.0), verdict
 
 
 def _camera(text: str | None, image: Path, size: tuple[int, int]) -> Camera:

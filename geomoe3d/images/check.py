@@ -55,7 +55,8 @@ def check_truth(scene: ImageScene, pairs: int = 40, seed: int = 0) -> TruthCheck
         for view in views:
             if view.path not in seen:
                 seen[view.path] = detect(view.path)
-        pixels = match(*(seen[view.path] for view in views)).distinct().pixels
+        matches = match(*(seen[view.path] for view in views))
+        pixels = matches.pixels[matches.distinct()]
         rays = np.hstack([v.camera.normalise(pixels[:, 2 * k : 2 * k + 2]) for k, v in enumerate(views)])
         scale = LONGER_SIDE / max(seen[views[0].path].size)
         found.append(residuals_of(relative_pose(*views), rays) * views[0].camera.focal * scale)

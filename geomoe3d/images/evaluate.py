@@ -22,7 +22,7 @@ from geomoe3d.evaluation.intervals import Quantity, measure_all
 from geomoe3d.evaluation.records import Measure
 from geomoe3d.geometry.essential import essential_of, label_threshold, pose_errors_deg, symmetric_distance
 from geomoe3d.images.cameras import Camera, ImageScene, View, opencv, relative_pose, rotation_deg
-from geomoe3d.images.features import Keypoints, Matches, detect, match, read_grey
+from geomoe3d.images.features import LOOSE_RATIO, Keypoints, Matches, detect, match, read_grey
 from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
@@ -171,7 +171,7 @@ def _methods(
     scene: str, pair: str, found: Matches, true: BoolArray, rays: FloatArray, network: ImageNetwork | None,
     estimators: dict[str, str], error: Callable[[Any, str], tuple[float, str]], turned: float = math.nan,
 ) -> Iterator[Outcome]:  # fmt: skip
-    distinct = found.mutual & (found.ratio < 0.8)
+    distinct, loose = found.distinct(), found.distinct(LOOSE_RATIO)
     ways: list[tuple[str, str, Any, float]] = [(BASELINE, "RANSAC", np.ones(len(found), dtype=bool), 0.0)]
     ways += [(f"ratio test, {name}", name, distinct, 0.0) for name in list(estimators)[:2]]
     if network is not None:
@@ -179,8 +179,10 @@ def _methods(
         weights = np.maximum(np.tanh(network(rays).logits), 0.0)
         spent = time.perf_counter() - start
         kind = {"geomoe": "GeoMoE"}.get(network.model.config.kind, network.model.config.kind)
-        ways += [(f"{kind}, {name}", name, weights if k == 2 else weights > 0, spent)
-                 for k, name in enumerate(estimators)]  # fmt: skip
+        for k, name in enumerate(estimators):  # the last one takes the weights themselves
+            ways.append((f"{kind}, {name}", name, weights if k == 2 else weights > 0, spent))
+            if k < 2:
+                ways.append((f"{kind} and loose ratio test, {name}", name, loose & (weights > 0), spent))
     for method, estimator, kept, before in ways:
         start = time.perf_counter()
         wrong, status = error(kept, estimators[estimator])

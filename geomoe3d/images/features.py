@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ from geomoe3d.types import BoolArray, Float32Array, FloatArray
 Detector = Literal["rootsift", "sift", "orb"]
 NUM_KEYPOINTS = 2000
 LONGER_SIDE = 800
-RATIO = 0.8
+RATIO, LOOSE_RATIO = 0.8, 0.95
+"""Ratio test by itself, and behind a network that rejects wrong matches."""
 _CONTRAST = 1e-5
 """So low that images without much contrast give as many keypoints as are asked for."""
 
@@ -53,13 +54,9 @@ class Matches:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def take(self, rows: NDArray[Any]) -> Matches:
-        """The given rows, index or mask."""
-        return replace(self, pixels=self.pixels[rows], ratio=self.ratio[rows], mutual=self.mutual[rows])
-
-    def distinct(self, ratio: float = RATIO) -> Matches:
-        """Mutual ones that pass the ratio test."""
-        return self.take(self.mutual & (self.ratio < ratio))
+    def distinct(self, ratio: float = RATIO) -> BoolArray:
+        """(N,) mutual ones that pass the ratio test."""
+        return self.mutual & (self.ratio < ratio)
 
 
 def read_grey(path: str | Path) -> NDArray[np.uint8]:

@@ -3,11 +3,13 @@
 Matches, kept ones or all, go to an estimator: the weighted eight-point algorithm, OpenCV's five-point RANSAC or
 its MAGSAC++. Of the poses that an essential matrix allows, the one with the points before both cameras is taken.
 What two images cannot tell is looked for afterwards: a translation where the cameras only turned or hardly moved,
-a single pose where all inliers lie in one plane, and agreement that chance would give as well.
+a single pose where all inliers lie in one plane, agreement that chance would give as well, and whether half of the
+matches give the same pose.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,19 +22,20 @@ from geomoe3d.geometry.essential import (
     decompose,
     depths,
     essential_of,
+    pose_errors_deg,
     symmetric_distance,
     weighted_eight_point,
 )
 from geomoe3d.images.cameras import Camera, opencv, rotation_deg
 from geomoe3d.images.features import checked
-from geomoe3d.types import BoolArray, FloatArray
+from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 Estimator = Literal["magsac", "ransac", "eight_point"]
 PIXEL_SHARE = 1.0 / 800
 """Default inlier threshold, a share of the image's longer side: one pixel of the image as keypoints are sought."""
 
 _MOST_SAMPLES, _CONFIDENCE = 2_000, 0.99999
-_LEAST_INLIERS = 20
+_LEAST_INLIERS, _MOST_BETWEEN_HALVES_DEG = 30, 10.0
 _OVER_CHANCE = 3.0
 _EXPLAINED, _OTHER_POSE_DEG = 0.9, 3.0
 _LEAST_PARALLAX = 3.0
@@ -117,7 +120,11 @@ def find_pose(
     front = np.zeros(len(pixels), dtype=bool)
     front[usable] = before_both(T, rays[usable])
     inliers = kept & front & (residuals < threshold)
-    return _judged(T, rays, inliers, residuals, kept, threshold / focal, focal)
+
+    def again(rows: IntArray) -> FloatArray | None:
+        return _estimate(rays[rows], w[rows], estimator, threshold / focal, seed)
+
+    return _judged(T, rays, inliers, residuals, kept, threshold / focal, focal, again)
 
 
 def residuals_of(T: FloatArray, rays: FloatArray) -> FloatArray:
@@ -169,7 +176,7 @@ def _estimate(
 
 def _judged(
     T: FloatArray, rays: FloatArray, inliers: BoolArray, residuals: FloatArray, kept: BoolArray, threshold: float,
-    focal: float,
+    focal: float, again: Callable[[IntArray], FloatArray | None],
 ) -> PoseResult:  # fmt: skip
     """What the inliers say of the pose."""
     found = int(inliers.sum())
@@ -196,12 +203,31 @@ def _judged(
             if alternatives:
                 ambiguous = True
                 reasons.append("nearly all inliers lie in one plane, and a second pose explains them as well")
+            elif (off := _between_halves(T, np.flatnonzero(kept), again)) > _MOST_BETWEEN_HALVES_DEG:
+                reasons.append(
+                    f"half of the matches alone give a pose that is off by {off:.0f} degrees; "
+                    f"{_MOST_BETWEEN_HALVES_DEG:.0f} are allowed"
+                )
     status: Literal["ok", "low_confidence", "ambiguous"] = "ok"
     if reasons:
         status = "ambiguous" if ambiguous and len(reasons) == 1 else "low_confidence"
     return PoseResult(
         status, tuple(reasons), T[:3, :3], T[:3, 3], inliers, residuals, parallax * focal, alternatives
     )
+
+
+def _between_halves(T: FloatArray, kept: IntArray, again: Callable[[IntArray], FloatArray | None]) -> float:
+    """Largest angle in degrees, of rotation or translation, between T and the poses of either half of the matches."""
+    order = np.random.default_rng(0).permutation(kept)
+    off = 0.0
+    for half in (order[::2], order[1::2]):
+        other = again(half) if len(half) >= MIN_MATCHES else None
+        if other is None:
+            return 180.0
+        off = max(
+            off, *(float(angle) for angle in pose_errors_deg(torch.from_numpy(other), torch.from_numpy(T)))
+        )
+    return off
 
 
 def _by_chance(T: FloatArray, rays: FloatArray, threshold: float, rounds: int = 20) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
-from geomoe3d.config import DescriptorConfig, RegistrationConfig, ScoringConfig
+from geomoe3d.config import DescriptorConfig, RegistrationConfig, ScoringConfig, expert
 from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.estimators.base import Estimator, estimator
 from geomoe3d.estimators.proposals import propose
@@ -28,7 +28,6 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import Scorer, make_scorers, scorer
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-_FEW_MATCHES = 500
 _LINE = ("geomoe3d.registration", "geomoe3d.line", "geomoe3d.correspondence_registration")
 
 
@@ -156,7 +155,7 @@ class Pipeline:
 
     def agreeing(self, clouds: Clouds, places: Places, clock: StageClock) -> float:
         """Which share of some hundred matches the best of a few motions brings together; a look with least effort."""
-        pair = self.match(clouds, places, clock, _FEW_MATCHES)
+        pair = self.match(clouds, places, clock, expert().causes.mirrored_matches)
         quick = self.estimator.with_least_effort()
         found = propose(quick, pair, np.ones(len(pair.matched)), self.config.estimator)
         return max((h.proposal_score for h in found), default=0.0) / max(len(pair.matched), 1)

@@ -3,21 +3,60 @@
     python scripts/measure_house.py [--constants]
 
 A constant is a number, or a tuple, list, set or mapping of numbers, that is given a name at the level of a
-module; ``config.py`` files and the package ``config``, which hold the configuration, are left out. A circle is a
-set of files each of which imports, directly or through others, all of the others; imports inside functions count,
-those for type checkers alone do not.
+module; ``config.py`` files and the package ``config``, which hold the configuration, are left out. What decides an
+answer belongs there. The rest is of one of the kinds of `KINDS`; what no pattern of a kind fits counts as deciding. A
+circle is a set of files each of which imports, directly or through others, all of the others; imports inside
+functions count, those for type checkers alone do not.
 """
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import click
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "geomoe3d"
+
+KINDS = {
+    "of a file format, a protocol, a published data set or a version": (
+        "clouds/formats/*:*",
+        "batch/folder.py:* cli/errors.py:* data/safe_pickle.py:* data/splits.py:* data/rgbd.py:* data/fusion.py:*",
+        "*:*VERSION *:_LARGEST_TEXT *:_LARGEST_TRANSFORM *:_NO_DATA result.py:_ARRAYS doctor.py:GLIBC",
+        "batch/run.py:ALL_THAT_FIT",
+    ),
+    "of mathematics, physics or rounding: three points fix a motion, millimetres in a metre, what avoids 0 / 0": (
+        "*:_E24 *:_BITS *:_HALF *:_BINS *:_TINY *:_EPSILON *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_LIFT *:_MILLIMETRES",
+        "geometry/*:_DAMPING geometry/*:*TOLERANCE images/epipolar.py:_DAMPING *:_MAX_SKEW *:_FPFH *:_depth *:_GOLDEN",
+        "*:MIN_MATCHES",
+    ),
+    "of how an answer is shown, said or looked up": (
+        "visual/*:* cli/*:* batch/page.py:* batch/table.py:* evaluation/report_*:* multiway/page.py:*",
+        "multiway/merged.py:_UNKNOWN runtime/progress.py:* evaluation/summary.py:*",
+    ),
+    "of memory and time, by which the same answer is had: blocks, chunks, caches": (
+        "*:*BLOCK *:*CHUNK* *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE *:_KEPT_CLOUDS *:_KEPT_FEATURES",
+        "batch/memory.py:* features/cache.py:* runtime/*:* evaluation/tracks.py:_HASHED_BYTES networks/*:_PARTS",
+        "*:_MOST_FLAGS",
+    ),
+    "of a trained network, whose weights hold with them alone, or of a published architecture": (
+        "networks/*:* features/learned.py:* features/pyramid.py:* training/descriptor_network.py:* images/network.py:*",
+        "maps/level.py:SPACING",
+    ),
+    "of the protocol of a benchmark or of a measurement": (
+        "evaluation/*:*",
+        "data/statistics.py:* data/contact.py:*",
+    ),
+    "of the recipe of generated data or of a training, which its own settings and version identify": (
+        "data/*:* training/*:* images/*:*",
+    ),
+}
+"""What the constants are that decide no answer of a registration: kind -> patterns ``file:name``, asked in order."""
+
+DECIDES = "that decide an answer"
 
 
 @click.command()
@@ -38,21 +77,39 @@ def main(most: int, list_constants: bool) -> None:
     click.echo(f"{sum(lines.values()):7,}  lines in {len(files)} files\n")
     for path, count in sorted(lines.items(), key=lambda item: -item[1])[:most]:
         click.echo(f"{count:7,}  {path.relative_to(PACKAGE)}")
-    found = [
-        f"{path.relative_to(PACKAGE)}:{line} {name}"
-        for path, tree in trees.items()
-        if path.name != "config.py" and path.parent.name != "config"
-        for name, line in constants(tree)
-    ]
-    click.echo(f"\n{len(found):7,}  numeric constants of modules outside the configuration")
-    for place in found if list_constants else ():
-        click.echo(f"         {place}")
+    by_kind = constants_by_kind(trees)
+    count = sum(map(len, by_kind.values()))
+    click.echo(f"\n{count:7,}  numeric constants of modules outside the configuration, of these")
+    for kind, found in by_kind.items():
+        click.echo(f"{len(found):11,}  {kind}")
+        for place in found if list_constants else ():
+            click.echo(f"             {place}")
     circles = import_circles(trees)
     click.echo(f"{len(circles):7,}  import circles between files")
     for circle in circles:
         click.echo(f"         {', '.join(circle)}")
     at_root = sorted(path.name for path in files if path.parent == PACKAGE)
     click.echo(f"{len(at_root):7,}  Python files at the package's root: {', '.join(at_root)}")
+
+
+def constants_by_kind(trees: dict[Path, ast.Module]) -> dict[str, list[str]]:
+    """``file:line name`` of every constant outside the configuration, by the kinds of `KINDS` and by `DECIDES`."""
+    by_kind: dict[str, list[str]] = {DECIDES: [], **{kind: [] for kind in KINDS}}
+    for path, tree in trees.items():
+        if path.name == "config.py" or path.parent.name == "config":
+            continue
+        file = path.relative_to(PACKAGE).as_posix()
+        for name, line in constants(tree):
+            by_kind[kind_of(f"{file}:{name}")].append(f"{file}:{line} {name}")
+    return by_kind
+
+
+def kind_of(constant: str) -> str:
+    """The kind of a constant, ``file:name``."""
+    for kind, patterns in KINDS.items():
+        if any(fnmatchcase(constant, pattern) for pattern in " ".join(patterns).split()):
+            return kind
+    return DECIDES
 
 
 def constants(tree: ast.Module) -> Iterator[tuple[str, int]]:

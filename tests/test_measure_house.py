@@ -39,3 +39,27 @@ def test_circles_are_found_through_functions_but_not_through_type_checks(house, 
     }
     trees = {tmp_path / "package" / f"{name}.py": ast.parse(text) for name, text in texts.items()}
     assert house.import_circles(trees) == [["package.a", "package.b", "package.c"]]
+
+
+def test_a_constant_is_of_the_first_kind_that_fits_and_else_decides(house):
+    assert house.kind_of("clouds/formats/las.py:_LARGEST").startswith("of a file format")
+    assert house.kind_of("maps/store.py:VERSION").startswith("of a file format")
+    assert house.kind_of("visual/page.py:MAX_POINTS").startswith("of how an answer is shown")
+    assert house.kind_of("decision/scale.py:_UNITS").startswith("of mathematics")
+    assert house.kind_of("scoring/surfaces.py:_LEAST_COSINE") == house.DECIDES
+
+
+def test_what_decides_an_answer_stands_in_the_configuration(house):
+    """Still to come: the confidence, which is about to be fitted anew, and the poses of many scans."""
+    trees = {
+        path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(house.PACKAGE.rglob("*.py"))
+    }
+    found = house.constants_by_kind(trees)
+    left = [
+        place
+        for place in found[house.DECIDES]
+        if not place.startswith(("multiway/", "decision/confidence.py"))
+    ]
+    assert left == []
+    used = {kind for kind, places in found.items() if places}
+    assert used == {house.DECIDES, *house.KINDS}

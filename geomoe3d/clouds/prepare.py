@@ -21,10 +21,6 @@ from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 _MIN_POINTS = 3
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
 _BITS = 21  # of a 64-bit voxel key, for each axis
-# Whether points fill space: how many are looked at, within how many voxels, with how many neighbours at least; how many
-# are asked, and the variation from which they do: few at first.
-_SCATTER_SAMPLE, _SCATTER_RADIUS, _SCATTER_LEAST = 20_000, 2.5, 8
-_SCATTERED = ((40, 0.11), (400, 0.15))
 
 
 def prepare(
@@ -204,8 +200,9 @@ def _fills_space(points: FloatArray, voxel_size: float) -> bool:
     Of 51 recorded pairs and 72 indoor fragments the variation is at most 0.13, of two pairs of airborne tiles and
     one of forest 0.17 to 0.19.
     """
-    means = voxel_means(points[:: max(1, len(points) // _SCATTER_SAMPLE)], voxel_size)
-    return all(_surface_variation(means, voxel_size, asked) > most for asked, most in _SCATTERED)
+    means = voxel_means(points[:: max(1, len(points) // expert().scatter.sample)], voxel_size)
+    rounds = zip(expert().scatter.asked, expert().scatter.variations, strict=True)
+    return all(_surface_variation(means, voxel_size, asked) > most for asked, most in rounds)
 
 
 def _surface_variation(points: FloatArray, voxel_size: float, count: int) -> float:
@@ -217,10 +214,10 @@ def _surface_variation(points: FloatArray, voxel_size: float, count: int) -> flo
     places = (points - points.mean(0)) / voxel_size
     asked = places[:: max(1, len(places) // count)]
     squared = (asked**2).sum(1)[:, None] + (places**2).sum(1) - 2 * asked @ places.T
-    near = (squared < _SCATTER_RADIUS**2).astype(np.float64)
+    near = (squared < expert().scatter.radius ** 2).astype(np.float64)
     held = near.sum(1)
-    near = near[held >= _SCATTER_LEAST] / held[held >= _SCATTER_LEAST, None]
-    if len(near) < _SCATTER_LEAST:
+    near = near[held >= expert().scatter.least] / held[held >= expert().scatter.least, None]
+    if len(near) < expert().scatter.least:
         return 0.0
     products = np.einsum("ni,nj->nij", places, places).reshape(-1, 9)
     means = near @ places

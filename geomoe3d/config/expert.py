@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
-from geomoe3d.config.expert_clouds import LoadingExpert, PreparationExpert, ViewpointExpert
+from geomoe3d.config.expert_clouds import LoadingExpert, PreparationExpert, ScatterExpert, ViewpointExpert
 from geomoe3d.config.expert_decision import (
     AccuracyExpert,
     CausesExpert,
@@ -65,6 +65,7 @@ class ExpertConfig(Section):
     loading: LoadingExpert = LoadingExpert()
     preparation: PreparationExpert = PreparationExpert()
     viewpoint: ViewpointExpert = ViewpointExpert()
+    scatter: ScatterExpert = ScatterExpert()
 
 
 _IN_FORCE: ContextVar[ExpertConfig] = ContextVar("expert constants in force")

@@ -156,6 +156,9 @@ class CausesExpert(Section):
         "most confidence of an answer whose scale differs or whose source is mirrored",
     )
     sure: float = constant(0.99, "probability", (0, 1), "an ok answer above it is not tried mirrored")
+    mirrored_matches: int = constant(
+        500, "matches", (3, 1_000_000), "that a mirrored source is given to agree with a few transforms"
+    )
     mirrored_support: float = constant(
         0.028,
         "votes per match",

@@ -294,8 +294,7 @@ ORDER = [
     {"line"},
     {"registration"},
     {"evaluation", "batch", "multiway"},
-    {"images"},
-    {"training"},
+    {"images", "training"},
     {"cli", "__main__"},
 ]
 """Each may import from its own level and those above it in this list."""

@@ -9,7 +9,7 @@ import torch
 
 from geomoe3d.errors import CheckpointError
 from geomoe3d.geometry.essential import MIN_MATCHES
-from geomoe3d.images.generate import neighbors_of
+from geomoe3d.networks.neighbors import neighbors_in_batch
 from geomoe3d.networks.pretrained import load_network
 from geomoe3d.types import FloatArray, IntArray
 
@@ -52,7 +52,7 @@ class ImageNetwork:
         if len(rays) < MIN_MATCHES:
             return Verdict(torch.zeros(len(rays)).numpy(), None, None)
         x = torch.from_numpy(rays).float()[None]
-        neighbors = neighbors_of(x, min(self.model.config.num_neighbors, len(rays)))
+        neighbors = neighbors_in_batch(x, min(self.model.config.num_neighbors, len(rays)))
         out = self.model(x, None, neighbors, insight=True)
         last = out.insights[-1] if out.insights else None
         sub_field = None if last is None else last.sub_field[0].numpy()

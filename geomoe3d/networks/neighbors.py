@@ -56,6 +56,15 @@ def nearest_neighbors(values: Tensor, num_neighbors: int) -> Tensor:
     return torch.from_numpy(found).to(values.device)
 
 
+def neighbors_in_batch(values: Tensor, num_neighbors: int) -> Tensor:
+    """Nearest rows (B, N, K) of each of (B, N, C), N >= K, the row itself first; brute force on any device."""
+    import torch
+
+    distance = torch.cdist(values, values, compute_mode="donot_use_mm_for_euclid_dist")
+    distance.diagonal(dim1=1, dim2=2).fill_(-1)
+    return distance.topk(num_neighbors, dim=2, largest=False).indices
+
+
 def _itself_first(index: NDArray[Any], num_neighbors: int) -> IntArray:
     """Neighbours (N, k <= K) with the row itself in front, filled up to (N, K); a duplicate may come before it."""
     index = index.astype(np.int64)

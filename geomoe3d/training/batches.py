@@ -22,14 +22,15 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from geomoe3d.data.shards import is_shard
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import rotation_error_deg
-from geomoe3d.images.generate import ImagePairsConfig, generate_matches, neighbors_of
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.inputs import BatchInput, PairInput, collate, pair_input, under_motions
 from geomoe3d.networks.motion_inputs import MotionInputs
+from geomoe3d.networks.neighbors import neighbors_in_batch
 from geomoe3d.runtime.threads import THREADS_VARIABLE
 from geomoe3d.training.augment import augment
 from geomoe3d.training.config import DataConfig, TrainConfig
 from geomoe3d.training.fragment_pairs import FragmentPairs
+from geomoe3d.training.image_pairs import ImagePairsConfig, generate_matches
 from geomoe3d.training.losses import network_motion
 from geomoe3d.training.pairs import PairDataset, ShardFolder, TrainingPair
 from geomoe3d.training.synthetic import SyntheticPairs
@@ -263,7 +264,7 @@ class ImagePairs:
         """Batch ``number`` of ``size`` pairs."""
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1, np.uint64)[0] >> 1)
         drawn = generate_matches(self.config, size, seed, device)
-        neighbors = neighbors_of(drawn.matches, self.network.num_neighbors)
+        neighbors = neighbors_in_batch(drawn.matches, self.network.num_neighbors)
         inputs = BatchInput(drawn.matches, None, neighbors, None)
         return Batch(inputs, drawn.labels, drawn.truth, None, torch.arange(size, device=device))
 

@@ -7,9 +7,10 @@ import torch
 
 from geomoe3d.errors import ConfigError
 from geomoe3d.geometry.essential import essential_of, label_threshold, symmetric_distance
-from geomoe3d.images.generate import ImagePairsConfig, generate_matches, neighbors_of
+from geomoe3d.networks.neighbors import neighbors_in_batch
 from geomoe3d.training.batches import ImagePairs
 from geomoe3d.training.config import load_train_config
+from geomoe3d.training.image_pairs import ImagePairsConfig, generate_matches
 from geomoe3d.training.losses import LossConfig, epipolar_loss
 from geomoe3d.training.trainer import TrainingRun
 
@@ -60,7 +61,7 @@ def test_the_same_seed_draws_the_same_and_another_seed_others():
 def test_neighbours_are_the_nearest_rows_the_row_itself_first():
     x = torch.randn(2, 40, 4, generator=torch.Generator().manual_seed(0))
     x[0, 1] = x[0, 0]  # a duplicate never takes the row's own place
-    found = neighbors_of(x, 5)
+    found = neighbors_in_batch(x, 5)
     assert torch.equal(found[..., 0], torch.arange(40).expand(2, 40))
     expected = torch.cdist(x, x).topk(5, largest=False).values
     gathered = torch.stack([(x[b][found[b]] - x[b][:, None]).norm(dim=-1) for b in range(2)])

@@ -249,10 +249,3 @@ def _wrong_targets(
     inside = (copied.abs() < half1[:, None]).all(-1) & seen & (least < 1)
     use = inside & (draw.uniform(1) < config.repeated) & (draw.uniform() < draw.between(0.1, 0.7, 1))
     return torch.where(use[..., None], copied, wrong)
-
-
-def neighbors_of(matches: Tensor, num_neighbors: int) -> Tensor:
-    """Nearest rows (B, N, K) of (B, N, 4) in all four coordinates, the row itself first; on any device."""
-    distance = torch.cdist(matches, matches, compute_mode="donot_use_mm_for_euclid_dist")
-    distance.diagonal(dim1=1, dim2=2).fill_(-1)
-    return distance.topk(num_neighbors, dim=2, largest=False).indices

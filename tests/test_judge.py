@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -412,3 +413,22 @@ def test_statuses_survive_points_that_move_by_a_millionth(seed: int) -> None:
     answer = geomoe3d.register(moved(source.file_points), moved(twice), voxel_size=0.07)
     assert answer.status == "ambiguous"
     assert min(rotation_error_deg(answer.T_target_source, place) for place in (T, half_turn @ T)) < 1
+
+
+@pytest.mark.parametrize(("name", "heard"), [("with the network:", True), ("without the network:", False)])
+def test_the_formula_of_the_confidence_in_the_docs_has_its_coefficients(name: str, heard: bool) -> None:
+    """To the last digit that is printed; after a new fit docs/concepts.md is changed too."""
+    text = (Path(__file__).parents[1] / "docs" / "concepts.md").read_text()
+    formula = " ".join(text[text.index(name) :].split("violation)")[0].split()).partition("sigmoid(")[2]
+    added = [float(number) for number in re.findall(r"\+ ([\d.]+)\)", formula)]
+    assert added == [
+        confidence._LEAST_OVERLAP,
+        confidence._ADDED_OBSERVABILITY,
+        confidence._LEAST_SUPPORT,
+    ]
+    terms = re.sub(r"ln\([^)]*\)", "", formula)
+    printed = [float(number.replace(" ", "")) for number in re.findall(r"[-+]? ?\d+\.\d+", terms)]
+    offset, slopes = confidence._COEFFICIENTS[heard, True]
+    assert printed == pytest.approx([offset, *slopes], abs=0.00501)
+    names = re.findall(r"ln\((\w+)", formula)
+    assert names == ["surface_score", "lead", "overlap", "observability", "looseness", "support"]

@@ -41,6 +41,28 @@ def test_size_and_cost_are_the_published_ones(kind: str) -> None:
     assert count_cost(model, 2000).layers == pytest.approx(cost, rel=1e-3)  # 6D; most are published in 4D
 
 
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("pointcn", 403_201),
+        ("oanet", 2_472_538),
+        ("umatch", 7_764_568),
+        ("dematch", 5_858_949),
+        ("demo", 4_519_588),
+    ],
+)
+def test_the_forms_for_two_images_have_the_published_size_and_learn(kind: str, parameters: int) -> None:
+    config = build_config(NetworkConfig, {"kind": kind, "correspondence_dim": 4})
+    assert num_parameters(build_network(config)) == parameters
+    model = build_network(
+        config.model_copy(update={"width": 32, "num_heads": 2, "num_sub_fields": 12})
+    ).train()
+    out = model(sample(2, 60, 1, 4))
+    out.logits.square().mean().backward()
+    assert bool(out.logits.isfinite().all())
+    assert all(bool(p.grad.isfinite().all()) for p in model.parameters() if p.grad is not None)
+
+
 @each_kind
 def test_order_of_the_correspondences_does_not_matter(kind: str) -> None:
     model = settle(small(kind))
@@ -120,8 +142,8 @@ def test_weights_on_disk_are_the_network(kind: str, tmp_path: Path) -> None:
 def test_keys_that_mean_nothing_to_a_baseline_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"prior=soft means nothing to the network 'pointcn'"):
         build_config(NetworkConfig, {"kind": "pointcn", "prior": "soft"})
-    with pytest.raises(ConfigError, match=r"correspondence_dim"):
-        build_config(NetworkConfig, {"kind": "demo", "correspondence_dim": 4})
+    with pytest.raises(ConfigError, match=r"correspondence_dim"):  # it compares lengths in space
+        build_config(NetworkConfig, {"kind": "pointdsc", "correspondence_dim": 4})
     with pytest.raises(ConfigError, match=r"needs coordinates"):
         build_config(NetworkConfig, {"kind": "oanet", "motion_form": "none"})
     with pytest.raises(ConfigError, match=r"checkpoint_activations"):

@@ -30,13 +30,13 @@ _PUBLISHED: dict[str, dict[str, Any]] = {
 """Of each baseline, what differs from GeoMoE's defaults."""
 
 _USED: dict[str, tuple[str, ...]] = {
-    "pointcn": ("motion_form",),
-    "oanet": ("motion_form", "num_sub_fields"),
-    "umatch": ("motion_form", "num_heads"),
-    "dematch": ("num_heads", "num_sub_fields"),
+    "pointcn": ("motion_form", "correspondence_dim"),
+    "oanet": ("motion_form", "num_sub_fields", "correspondence_dim"),
+    "umatch": ("motion_form", "num_heads", "correspondence_dim"),
+    "dematch": ("num_heads", "num_sub_fields", "correspondence_dim"),
     "demo": (
         "motion_form", "num_heads", "num_sub_fields", "num_neighbors", "context_width", "embedding_norm",
-        "knn_space",
+        "knn_space", "correspondence_dim",
     ),
     "pointdsc": ("motion_form", "compatibility_threshold"),
 }  # fmt: skip

@@ -18,12 +18,12 @@ _CLUSTER, _REFINE = 2, 4  # attention blocks of each kind in a layer
 
 
 class DeMatch(CorrespondenceNetwork):
-    """``num_layers`` layers of seven attention blocks on ``num_sub_fields`` tokens; 5,859,013 parameters."""
+    """``num_layers`` layers of seven attention blocks each; 5,859,013 parameters (4D: 5,858,949)."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
-        self.of_motion = Embedding(config.width)
-        self.of_position = Embedding(config.width)
+        self.of_motion = Embedding(config.width, config.correspondence_dim // 2)
+        self.of_position = Embedding(config.width, config.correspondence_dim // 2)
         self.tokens = nn.Parameter(torch.randn(config.width, config.num_sub_fields))
         self.layers = nn.ModuleList(
             DecompositionLayer(config.width, config.num_heads) for _ in range(config.num_layers)
@@ -44,17 +44,17 @@ class DeMatch(CorrespondenceNetwork):
 
 
 class Embedding(nn.Module):
-    """Three coordinates to ``width`` channels by three 1x1 maps."""
+    """Coordinates of a point to ``width`` channels by three 1x1 maps."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, num_in: int) -> None:
         super().__init__()
         narrow, middle = max(1, width // 4), max(1, width // 2)
-        self.linear1 = Pointwise(3, narrow)
+        self.linear1 = Pointwise(num_in, narrow)
         self.norm1, self.linear2 = BatchNorm(narrow), Pointwise(narrow, middle)
         self.norm2, self.linear3 = BatchNorm(middle), Pointwise(middle, width)
 
     def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
-        """(B, 3, N) to (B, width, N)."""
+        """(B, num_in, N) to (B, width, N)."""
         h = norm_relu_linear(self.linear1(x), self.norm1, self.linear2, mask)
         return norm_relu_linear(h, self.norm2, self.linear3, mask)
 

@@ -20,7 +20,7 @@ _LEAST_WEIGHT, _LARGEST_WEIGHT = 0.05, 0.95
 
 
 class DeMo(CorrespondenceNetwork):
-    """``num_layers`` double layers with ``num_sub_fields`` samples; 4,519,908 parameters."""
+    """``num_layers`` double layers with ``num_sub_fields`` samples; 4,519,908 parameters (4D: 4,519,588)."""
 
     uses_neighbors = True
 
@@ -28,7 +28,7 @@ class DeMo(CorrespondenceNetwork):
         super().__init__(config)
         place_width = max(1, config.width // 2)
         self.initialise = MotionInitialisation(config)
-        self.place = Pointwise(3, place_width)
+        self.place = Pointwise(config.correspondence_dim // 2, place_width)
         self.place_block = PointCN(place_width)
         self.layers = nn.ModuleList(DoubleLayer(config, place_width) for _ in range(config.num_layers))
 
@@ -38,7 +38,7 @@ class DeMo(CorrespondenceNetwork):
         """See `CorrespondenceNetwork.verdicts`: one verdict per double layer."""
         assert neighbors is not None
         field = self.initialise(coordinates, None, mask)
-        places = self.place_block(self.place(coordinates[..., :3].transpose(1, 2)), mask)
+        places = self.place_block(self.place(coordinates.transpose(1, 2).chunk(2, dim=1)[0]), mask)
         found = []
         for layer in self.layers:
             field, logits = layer(field, places, neighbors, mask)

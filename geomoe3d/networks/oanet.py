@@ -1,7 +1,7 @@
 """OANet: clusters of correspondences, filtered in an order that the network learns, in two stages.
 
 Source: Zhang et al., Learning two-view correspondences and geometry using order-aware network (ICCV 2019).
-Its second stage sees residuals to the first stage's epipolar geometry; here those of a rigid motion.
+Its second stage sees residuals to the first stage's epipolar geometry, or to its rigid motion for points in space.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from geomoe3d.geometry.essential import symmetric_distance, weighted_eight_point
 from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.base import CorrespondenceNetwork
@@ -21,7 +22,7 @@ _CARRIED = 2  # channels that the first stage hands on: residual and weight
 
 
 class OANet(CorrespondenceNetwork):
-    """``num_layers`` stages with ``num_sub_fields`` clusters; 2,473,050 parameters."""
+    """``num_layers`` stages with ``num_sub_fields`` clusters; 2,473,050 parameters (4D: 2,472,538)."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -130,7 +131,14 @@ class NarrowingPointCN(nn.Module):
 
 @torch.no_grad()
 def _residuals(coordinates: Tensor, weights: Tensor) -> Tensor:
-    """(B, N) distance of each target point from its source point under the weighted motion; 0 without one."""
+    """(B, N) distance of each target point from its source point under the weighted motion; 0 without one.
+
+    Of image points the symmetric squared distance to the epipolar lines, at most 1.
+    """
+    if coordinates.shape[-1] == 4:
+        fit = weighted_eight_point(coordinates, weights)
+        square = symmetric_distance(fit.E, coordinates.double()).clamp(max=1.0)
+        return (square * fit.valid[:, None]).to(coordinates.dtype)
     source, target = coordinates[..., :3], coordinates[..., 3:]
     T, solved = weighted_kabsch(source, target, weights)
     moved = source @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]

@@ -32,8 +32,8 @@ def overfit_one_batch(
         Steps taken and the last F1 on the batch (in training mode), also if the target was not reached.
     """
     device = choose_device(config.device, Process())
-    torch.manual_seed(config.seed)
     batch = first_batch(config)
+    torch.manual_seed(config.seed)  # the loader draws a number of its own
     model = build_network(config.network).to(device).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.0)
     updater = Updater(model, model, optimizer, config.model_copy(update={"accumulation": 1}))

@@ -256,6 +256,7 @@ def test_both_sides_are_the_features_of_turned_normals():
     off = np.abs(both_sides(features(normals)) - features(-normals)).max(axis=1)
     assert np.median(off) < 1e-5
     assert np.median(np.abs(features(normals) - features(-normals)).max(axis=1)) > 0.01
+    assert both_sides(np.zeros((0, 99), dtype=np.float32)).shape == (0, 99)
 
 
 # ---- the command line ----------------------------------------------------------------------------------

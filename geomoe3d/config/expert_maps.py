@@ -32,7 +32,13 @@ class MapsExpert(Section):
         20, "-", (1, 10_000), "one of so many of the map's points, where that is more"
     )
     most_points: int = constant(
-        1_000_000, "points", (1000, 1_000_000_000), "of any grid: 50 s of processor time, and 150 MB"
+        1_000_000, "points", (1000, 1_000_000_000), "of it at most: 40 s of processor time, and 220 MB"
+    )
+    asked_points: int = constant(
+        300_000,
+        "points",
+        (1000, 1_000_000_000),
+        "at most, of a grid on which a map is described because a scan asks for it",
     )
     candidates: int = constant(4, "places", (1, 1000), "that are compared as pairs of scans are")
     largest_scan: float = constant(
@@ -41,7 +47,12 @@ class MapsExpert(Section):
     finer: float = constant(
         1.3, "ratio", (1, 10), "a grid whose voxels are so many times smaller than the scan's own serves it"
     )
-    least_voxels: int = constant(600, "voxels", (10, 1_000_000), "that a scan fills on a grid that serves it")
+    least_voxels: int = constant(
+        200,
+        "voxels",
+        (10, 1_000_000),
+        "that a scan fills on a grid that serves it: on coarse ones more is found",
+    )
     known: float = constant(
         0.1,
         "length",

@@ -47,7 +47,7 @@ def both_sides(features: Float32Array) -> Float32Array:
     Of the three angles between two points' frames two change their sign and one does not (u and v turn over, w does
     not), so the first and the third histogram of each 33 numbers are mirrored.
     """
-    blocks = features.reshape(len(features), -1, 3, _BINS).copy()
+    blocks = features.reshape(len(features), features.shape[1] // (3 * _BINS), 3, _BINS).copy()
     blocks[:, :, [0, 2]] = blocks[:, :, [0, 2], ::-1]
     turned: Float32Array = blocks.reshape(features.shape)
     return turned

@@ -189,7 +189,8 @@ class Map:
             known = expert().maps
             usual = min(max(known.usual_points, self.num_points // known.usual_share), known.most_points)
             wanted = round_size(max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge))
-        self._level(wanted, wanted)
+        if not any(wanted / expert().maps.finer <= x.voxel_size <= wanted for x in self._levels):
+            self._described(wanted)
 
     @property
     def num_points(self) -> int:
@@ -267,15 +268,24 @@ class Map:
         return robust_extent(self._voxels.points)
 
     def _level(self, size: float, coarsest: float) -> Level:
-        """The level for a scan that has this grid by itself, at most so coarse; made if there is none."""
-        fitting = [x for x in self._levels if size / expert().maps.finer <= x.voxel_size <= coarsest]
+        """The level for a scan that has this grid by itself, at most so coarse; made if there is none.
+
+        What is made for a scan is no finer than a stated number of points allows, unless the grid is given.
+        """
+        finer = expert().maps.finer
+        fitting = [x for x in self._levels if size / finer <= x.voxel_size <= coarsest]
+        if not fitting and self.config.voxel_size is None:
+            size = max(size, self._voxels.edge_for(expert().maps.asked_points))
+            fitting = [x for x in self._levels if size / finer <= x.voxel_size <= finer * size]
         if not fitting:
-            size = max(size, self._voxels.edge, self._voxels.edge_for(expert().maps.most_points))
-            fitting = [x for x in self._levels if size / expert().maps.finer <= x.voxel_size <= size]
-        if not fitting:
-            fitting = [Level.of(self._voxels, size, self.config.preparation)]
-            self._levels = tuple(sorted((*self._levels, *fitting), key=_size))
+            return self._described(size)
         return min(fitting, key=lambda level: abs(math.log(level.voxel_size / size)))
+
+    def _described(self, size: float) -> Level:
+        """A new level."""
+        made = Level.of(self._voxels, max(size, self._voxels.edge), self.config.preparation)
+        self._levels = tuple(sorted((*self._levels, made), key=_size))
+        return made
 
     def _refused(self, cloud: PointCloud) -> str | None:
         """A sentence where scan and map cannot belong together."""

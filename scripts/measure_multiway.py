@@ -9,7 +9,8 @@
 Ground truth is used for scoring only. A fragment is placed rightly when its pose in the largest group is
 within 15 deg and 30 cm of the published one, after the group as a whole has been laid on it (rigid fit of the
 fragments' frames, the worst tenth left out). A kept edge is wrong beyond the same limits; beyond 30 deg or
-1 m it is also counted as gross. A pair of the benchmarks is recalled when the poses of one group give its
+1 m it is also counted as gross; of one whose
+scan has no published pose nothing is known. A pair of the benchmarks is recalled when the poses of one group give its
 motion within 15 deg and 30 cm, or (RMSE) within 0.2 m of the benchmark's error where the pair is not
 consecutive; it is bent when its scans stand in one group and the motion is not within 15 deg and 30 cm. Each
 model is made by `geomoe3d multiway` in a process of its own; seconds are wall time of the whole command,
@@ -201,11 +202,14 @@ def score(folder: Path, room: Room) -> dict[str, Any]:
     largest = score_group(groups[0], truth) if groups else {"placed": 0, "errors": []}
     others = [score_group(group, truth)["placed"] for group in groups[1:]]
     kept = [edge for edge in model["edges"] if edge["kept"]]
-    wrong, gross = 0, 0
+    wrong, gross, unknown = 0, 0, 0
     for edge in kept:
         i, j, found = edge["target"], edge["source"], np.array(edge["T_target_source"])
         part = next((part for part in room.parts if i in part and j in part), None)
-        T = np.full((4, 4), np.nan) if part is None else inverse(part[i]) @ part[j]
+        if part is None:
+            unknown += 1
+            continue
+        T = inverse(part[i]) @ part[j]
         turn, shift = rotation_error_deg(found, T), translation_error(found, T)
         wrong += not (turn < 15 and shift < 0.30)
         gross += not (turn < 30 and shift < 1.0)
@@ -219,6 +223,7 @@ def score(folder: Path, room: Room) -> dict[str, Any]:
         "kept": len(kept),
         "wrong": wrong,
         "gross": gross,
+        "unknown": unknown,
         "pairs": model["num_pairs"],
         "benchmarks": {
             name: recall(groups, name, room.scene) for name in ("3DMatch", "3DLoMatch") if room.scene

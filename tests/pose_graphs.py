@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.geometry.se3 import inverse, make_transform
 from geomoe3d.multiway.edges import Edge, Shape
-from geomoe3d.multiway.grouping import GroupingRules
+from geomoe3d.multiway.rules import GroupingRules
 
 RULES = GroupingRules(tolerance=0.2, near_tolerance=0.125, kept_tolerance=0.125, kept_error=0.4)
 

@@ -10,7 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.geometry.se3 import inverse, make_transform
 from geomoe3d.multiway.cycles import closes, find_triangles, propagate, with_cycles
-from geomoe3d.multiway.grouping import Group, Growth, reconsidered
+from geomoe3d.multiway.doubtful import doubtful_pairs
+from geomoe3d.multiway.edges import Shape
+from geomoe3d.multiway.grouping import Growth, reconsidered
+from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import connected_parts, is_kept, settle
 
 
@@ -143,3 +146,67 @@ def test_parts_without_edges_between_them_stay_apart():
     rng = np.random.default_rng(0)
     links = [edge(a, b, np.eye(4), 0.9, rng) for a, b in ((3, 1), (4, 3), (0, 2))]
     assert connected_parts(range(6), links) == [[1, 3, 4], [0, 2], [5]]
+
+
+def bent_chain(count=12, bend_deg=0.6):
+    """Two groups side by side, of which the first drifts, each pair a little.
+
+    Returns shapes, truth, the edges of either group, and right ones between them at both ends.
+    """
+    rng = np.random.default_rng(3)
+    shapes = [Shape.of(rng.uniform(-1, 1, (200, 3)), np.zeros(3)) for _ in range(2 * count)]
+    places = [np.array([0.5 * (k % count), 0.2 * (k // count), 0]) for k in range(2 * count)]
+    truth = {k: make_transform(np.eye(3), place) for k, place in enumerate(places)}
+    drift = make_transform(Rotation.from_rotvec([0, 0, np.radians(bend_deg)]).as_matrix(), np.zeros(3))
+
+    def exact(j, i, confidence, off):
+        return edge(j, i, inverse(truth[i]) @ truth[j] @ off, confidence, rng)
+
+    first = [exact(k + 1, k, 0.999, drift) for k in range(count - 1)]
+    second = [exact(k + 1, k, 0.999, np.eye(4)) for k in range(count, 2 * count - 1)]
+    between = [exact(k + count, k, 0.95, np.eye(4)) for k in (0, count - 1)]
+    return shapes, truth, first, second, between
+
+
+def chained(edges, start):
+    poses = {start: np.eye(4)}
+    for e in edges:
+        poses[e.source] = poses[e.target] @ e.T_target_source
+    return Group(poses, list(edges))
+
+
+def test_a_group_that_drifted_is_unbent_as_it_joins_another():
+    shapes, truth, first, second, between = bent_chain()
+    a, b = chained(first, 0), chained(second, 12)
+
+    def witness(one, other, T_a_b):  # against all that is not about right
+        off = largest_error({**one, **{k: T_a_b @ T for k, T in other.items()}}, truth)
+        return T_a_b, 1.0 if off < 0.2 else -20.0
+
+    def run(edges, align=lambda poses: poses):
+        return Growth([a, b], edges, shapes, RULES, witness, align).run()
+
+    assert len(run(between, align=None)) == 2  # either place by itself contradicts the surfaces
+    (joined,) = run(between)
+    assert sorted(joined.poses) == list(range(24)) and len(joined.edges) == len(first) + len(second) + 2
+    rigid = {**a.poses, **{k: between[0].T_target_source @ T for k, T in b.poses.items()}}
+    assert largest_error(joined.poses, truth) < 0.2 < largest_error(rigid, truth)
+    wrong = replace(between[1], T_target_source=anywhere(np.random.default_rng(0)))
+    assert len(run([between[0], wrong])) == 2  # no drift makes these one
+
+
+def test_pairs_are_looked_at_again_between_groups_alone_the_likely_and_the_alike():
+    groups = [Group({k: np.eye(4) for k in range(20)}), Group({20: np.eye(4)}), Group({21: np.eye(4)})]
+    rng = np.random.default_rng(0)
+    similarity = rng.uniform(size=(22, 22))
+    likely, sure = {(3, 20): 0.4, (20, 21): 0.3}, {(5, 20)}
+
+    def confidence(pair):
+        return None if pair in sure else likely.get(pair, 0.0)
+
+    found = doubtful_pairs(groups, range(21), similarity, confidence)  # scan 21 cannot be used
+    assert (3, 20) in found and not sure & set(found)
+    assert all(pair[1] == 20 for pair in found) and 5 <= len(found) <= 13
+    alike = sorted((k for k in range(20) if k != 5), key=lambda k: -similarity[k, 20])
+    assert {(k, 20) for k in alike[:6]} <= set(found)
+    assert (19, 20) in doubtful_pairs(groups, range(21), similarity, confidence, sequence=True)

@@ -26,9 +26,9 @@ from geomoe3d.config import load_config
 from geomoe3d.errors import ConfigError, DependencyError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse, make_transform, rotation_error_deg, transform_points
 from geomoe3d.multiway.edges import Edge
-from geomoe3d.multiway.grouping import GroupingRules
 from geomoe3d.multiway.page import render_model_page
 from geomoe3d.multiway.report import _why_unplaced
+from geomoe3d.multiway.rules import GroupingRules
 from geomoe3d.multiway.scans import Scan
 from geomoe3d.runtime.journal import read_journal
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -62,7 +62,20 @@ _SHOWN = 20
     metavar="LENGTH DEGREES",
     help="Standard deviation of the transform between two scans by these poses. [2 voxels, 2 degrees]",
 )
-@click.option("--second-look", is_flag=True, help="Look twice at doubtful pairs: three times as slow.")
+@click.option(
+    "--second-look",
+    type=click.Choice(["between", "all", "none"]),
+    default="between",
+    metavar="WHICH",
+    help="Doubtful pairs to look at twice: between groups that are apart, all, or none. [between]",
+)
+@click.option(
+    "--optimizer",
+    type=click.Choice(["open3d", "gtsam"]),
+    default="open3d",
+    metavar="NAME",
+    help="Library that fits the poses to the pairs: open3d, or gtsam where it is installed. [open3d]",
+)
 @click.option("--e57", is_flag=True, help="Write OUT/groupN.e57 too: every point, each scan with its pose.")
 @click.option("--page/--no-page", default=True, help="Write OUT/page.html, or do not. [--page]")
 @click.option("--fresh", is_flag=True, help="Delete the earlier model in OUT first.")
@@ -85,7 +98,8 @@ def command(
     sequence: bool,
     initial: str | None,
     initial_error: tuple[float, float] | None,
-    second_look: bool,
+    second_look: str,
+    optimizer: Literal["open3d", "gtsam"],
     e57: bool,
     fresh: bool,
     cache: str | None,
@@ -124,6 +138,7 @@ def command(
             initial=initial,
             initial_error=initial_error,
             second_look=second_look,
+            optimizer=optimizer,
             e57=e57,
             progress=progress,
             say=lambda text: None if quiet else click.echo(text, err=True),

@@ -18,7 +18,8 @@ from geomoe3d.multiway.alignment import align_groups, align_scans
 from geomoe3d.multiway.cycles import with_cycles
 from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
-from geomoe3d.multiway.grouping import Group, Growth, Poses, largest_first, reconsidered
+from geomoe3d.multiway.grouping import Growth, largest_first, reconsidered
+from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.multiway.settling import settle
 from geomoe3d.multiway.survey import PairKey, Survey, key_of
 from geomoe3d.types import FloatArray
@@ -57,7 +58,7 @@ class Assembly:
         told = edges, survey.shapes, survey.rules
         groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
         for turn in range(_MOST_TURNS):
-            grown = Growth(groups, *told, self.witness).run()
+            grown = Growth(groups, *told, self.witness, self.align).run()
             if turn and len(grown) == len(groups):
                 break
             placed = [part for group in grown for part in reconsidered(group, *told, self.witness)]

@@ -9,65 +9,29 @@ weaker edges: these are found to disagree with the poses and rejected. Cost: mil
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from geomoe3d.geometry.se3 import inverse
+from geomoe3d.multiway.bending import unbend
 from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.multiway.pose_graph import optimise
+from geomoe3d.multiway.rules import Group, GroupingRules, Poses
 from geomoe3d.types import BoolArray, FloatArray
 
 _MOST_MOTIONS = 3  # of two groups that are weighed against each other
 _MOST_PROPOSALS = 60  # edges between two groups whose motions are looked at, the surest
 _MOST_WORTH = 8.0
 _ASKED = 60  # scans of each group that are asked about a motion, the nearest to its edges: bounds the time
+_LEAST_BENT = 3  # scans of a group that may be bent
 _RIVAL = 0.25  # of the worth of the best: a motion that the scans are asked about again
 
-Poses = dict[int, FloatArray]
 Witness = Callable[[Mapping[int, FloatArray], Mapping[int, FloatArray], FloatArray], tuple[FloatArray, float]]
 """Asked of two groups (poses of each) and a motion T_a_b (4, 4): the motion as the surfaces have it, and the
 log-odds by which the scans speak for it (negative: against)."""
-
-
-@dataclass(frozen=True)
-class GroupingRules:
-    """When groups are joined and edges kept.
-
-    Attributes:
-        tolerance: largest displacement of motions that agree when groups are joined, cloud units.
-        turn_deg: their largest turn.
-        near_tolerance: largest displacement from the poses of an edge over which they are optimised.
-        near_turn_deg: its largest turn from them.
-        kept_tolerance: largest displacement of a kept edge from the final poses, cloud units.
-        kept_turn_deg: its largest turn from them.
-        kept_error: largest `expected_error` of a kept edge, cloud units.
-        correlation: real errors of the sensor's place over what independent gaps would give: neighbouring
-            points err alike. In four scenes of depth cameras half lay above 14 to 21, a tenth above 26 to 45.
-        least_worth: edges with lower log-odds have no voice.
-        joined_worth: log-odds that the winning motion must have left.
-        further_share: of the log-odds of all supporters but the surest, since they are not independent.
-    """
-
-    tolerance: float
-    near_tolerance: float
-    kept_tolerance: float
-    kept_error: float
-    turn_deg: float = 8.0
-    near_turn_deg: float = 5.0
-    kept_turn_deg: float = 3.0
-    correlation: float = 20.0
-    further_share: float = 0.5
-    least_worth: float = 0.0
-    joined_worth: float = 2.0
-
-
-@dataclass
-class Group:
-    """Scans with poses T_group_scan (4, 4), local coordinates, and the edges that hold them together."""
-
-    poses: Poses
-    edges: list[Edge] = field(default_factory=list)
+Align = Callable[[Poses], Poses]
+"""Poses to better poses, by the surfaces of the scans."""
 
 
 @dataclass
@@ -77,14 +41,18 @@ class Motion:
     Attributes:
         T_a_b: (4, 4) group b in the frame of group a.
         supporters: edges that agree with it.
-        worth: what they bring together; once ``weighed``, without what the scans contradict.
+        voices: what they bring together.
+        worth: that; once ``weighed``, without what the scans contradict.
         weighed: whether the scans have been asked.
+        poses: of all scans of both groups in the frame of a, where joining them unbends them.
     """
 
     T_a_b: FloatArray
     supporters: list[Edge]
+    voices: float
     worth: float
     weighed: bool = False
+    poses: Poses | None = None
 
 
 class Growth:
@@ -96,6 +64,7 @@ class Growth:
         shapes: of all scans.
         rules: thresholds.
         witness: what the scans say of a motion between two groups; None: they are not asked.
+        align: lays scans on each other's surfaces, for groups that are unbent as they join; None: none are.
     """
 
     def __init__(
@@ -105,9 +74,11 @@ class Growth:
         shapes: Sequence[Shape],
         rules: GroupingRules,
         witness: Witness | None = None,
+        align: Align | None = None,
     ) -> None:
         self.groups = {min(group.poses): group for group in groups}
-        self._shapes, self._rules, self._witness = shapes, rules, witness
+        self._shapes, self._rules, self._witness, self._align = shapes, rules, witness, align
+        self._unbent: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
         home = {scan: number for number, group in self.groups.items() for scan in group.poses}
         self._between: dict[tuple[int, int], list[Edge]] = {}
         for edge in edges:
@@ -125,6 +96,8 @@ class Growth:
                 ((lead(ways), (-a, -b)) for (a, b), ways in self._ways.items()), default=(0.0, (0, 0))
             )
             if worth < self._rules.joined_worth:
+                if any(self._unbend(*pair) for pair in self._bent()):
+                    continue
                 return largest_first(self.groups.values())
             a, b = -pair[0], -pair[1]
             if all(way.weighed for way in self._ways[a, b]):
@@ -159,7 +132,8 @@ class Growth:
             if not free[best]:
                 break
             mine = np.flatnonzero(agreeing[best] & free)
-            found.append(Motion(motions[best], [edges[k] for k in mine], float(total[best])))
+            voices = float(total[best])
+            found.append(Motion(motions[best], [edges[k] for k in mine], voices, voices))
             free[mine] = False
         return found
 
@@ -184,6 +158,42 @@ class Growth:
                 way.worth += told
             way.weighed = True
         self._ways[a, b] = self._merged(self._ways[a, b], b)
+
+    def _bent(self) -> list[tuple[int, int]]:
+        """Pairs of groups that more than one way would join, the surest first, each asked once as they are."""
+        found = []
+        for (a, b), ways in self._ways.items():
+            sizes = [len(self.groups[k].poses) for k in (a, b)]
+            if self._align and min(sizes) >= _LEAST_BENT and len(ways) > 1 and not self._was_unbent(a, b):
+                found.append((-sum(way.voices for way in ways), a, b))
+        return [(a, b) for _, a, b in sorted(found)]
+
+    def _was_unbent(self, a: int, b: int) -> bool:
+        return (tuple(self.groups[a].poses), tuple(self.groups[b].poses)) in self._unbent
+
+    def _unbend(self, a: int, b: int) -> bool:
+        """Find one way of those that differ as far as drift explains, if the scans agree with it."""
+        self._unbent.add((tuple(self.groups[a].poses), tuple(self.groups[b].poses)))
+        ways = sorted(self._ways[a, b], key=lambda way: -way.voices)
+        one, other, best = self.groups[a], self.groups[b], ways[0]
+        further = [edge for way in ways[1:] for edge in way.supporters]
+        poses, fitting = unbend(one, other, best.T_a_b, best.supporters, further, self._shapes, self._rules)
+        share, ids = self._rules.further_share, {id(edge) for edge in fitting}
+        voices = best.voices + share * sum(min(e.worth, _MOST_WORTH) for e in fitting)
+        if not fitting or voices < self._rules.joined_worth or self._align is None or self._witness is None:
+            return False
+        joint = [*best.supporters, *fitting]
+        near = [self._around(group.poses, joint) for group in (one, other)]
+        aligned = self._align({k: poses[k] for part in near for k in part})
+        _, told = self._witness(*({k: aligned[k] for k in part} for part in near), np.eye(4))
+        if len(aligned) == len(poses):
+            poses = aligned
+        rivals = [way for way in ways[1:] if not ids & {id(edge) for edge in way.supporters}]
+        way = Motion(best.T_a_b, joint, voices, voices + told, weighed=True, poses=poses)
+        if lead([way, *sorted(rivals, key=lambda rival: -rival.worth)]) < self._rules.joined_worth:
+            return False
+        self._ways[a, b] = [way, *rivals]
+        return True
 
     def _around(self, poses: Poses, supporters: Sequence[Edge]) -> Poses:
         """The scans of a group nearest to where some edges end in it: far away, poses have drifted."""
@@ -216,11 +226,11 @@ class Growth:
     def _join(self, a: int, b: int) -> None:
         """Group b becomes part of group a; poses are optimised where there are loops to close."""
         way, one, other = self._ways[a, b][0], self.groups[a], self.groups.pop(b)
-        poses = {**one.poses, **{scan: way.T_a_b @ T for scan, T in other.poses.items()}}
+        poses = way.poses or {**one.poses, **{scan: way.T_a_b @ T for scan, T in other.poses.items()}}
         edges = [*one.edges, *other.edges, *way.supporters]
         grown = len(other.poses) > 1 or _octave(len(poses)) > _octave(len(one.poses))
         if grown and len(edges) >= len(poses):
-            poses = optimise(poses, edges, self._rules.tolerance)
+            poses = optimise(poses, edges, self._rules.tolerance, library=self._rules.optimizer)
         self.groups[a] = Group(poses, edges)
         crossing, self._between = self._between, {}
         for pair, some in crossing.items():

@@ -14,8 +14,8 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.edges import Edge, Shape, differences
-from geomoe3d.multiway.grouping import Poses
 from geomoe3d.multiway.pose_graph import spanning_tree
+from geomoe3d.multiway.rules import Poses
 from geomoe3d.types import FloatArray
 
 _LEAST_WORTH = 4.0  # of an edge whose loop is followed: about 0.98

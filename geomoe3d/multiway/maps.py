@@ -18,8 +18,8 @@ import numpy as np
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.multiway.alignment import Surface
 from geomoe3d.multiway.edges import Edge
-from geomoe3d.multiway.grouping import Group, Poses
 from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.types import FloatArray
 
 MAPS_FOLDER = "maps"

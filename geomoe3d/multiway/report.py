@@ -9,10 +9,10 @@ import numpy as np
 
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.multiway.edges import Edge, agrees, differences, expected_error, predicted_motion
-from geomoe3d.multiway.grouping import Group
 from geomoe3d.multiway.loops import find_loops
 from geomoe3d.multiway.model import EdgeReport, LoopReport, SceneGroup, SceneModel, file_poses
 from geomoe3d.multiway.pose_graph import spanning_tree
+from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import is_kept
 from geomoe3d.multiway.survey import Survey
 

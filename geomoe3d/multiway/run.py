@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.batch.folder import read_identity
+from geomoe3d.batch.folder import read_identity, remove_batch
 from geomoe3d.batch.memory import worker_bytes_of_any
 from geomoe3d.batch.run import Labour, try_out
 from geomoe3d.batch.store import BatchStore
@@ -27,9 +27,10 @@ from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
 from geomoe3d.multiway.defaults import NEIGHBORS as NEIGHBORS
 from geomoe3d.multiway.initial import InitialPoses, read_poses
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
+from geomoe3d.multiway.pose_graph import Library, require_gtsam
 from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
-from geomoe3d.multiway.survey import Survey
+from geomoe3d.multiway.survey import Looks, Survey
 from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.timing import StageClock
@@ -37,6 +38,9 @@ from geomoe3d.runtime.timing import StageClock
 _MAP_ROUNDS = 2
 _INITIAL_SHIFT = 2.0  # voxels
 _INITIAL_TURN_DEG = 2.0
+_ONCE = {"descriptor": "none", "grids": (), "max_correspondences": 0}  # no second look
+AGAIN_FOLDER = "again"
+"""In that of the pairs: those that were looked at a second time."""
 
 
 @shows_progress("pairs")
@@ -57,7 +61,8 @@ def register_scans(
     sequence: bool = False,
     initial: str | os.PathLike[str] | None = None,
     initial_error: tuple[float, float] | None = None,
-    second_look: bool = False,
+    second_look: str = "between",
+    optimizer: Library = "open3d",
     e57: bool = False,
     progress: Watch = None,
     say: Callable[[str], None] | None = None,
@@ -85,8 +90,9 @@ def register_scans(
         initial: a file with a pose per scan, see `geomoe3d.multiway.initial.read_poses`; implies a sequence.
         initial_error: standard deviation of the motion between two scans that follow each other by these
             poses, cloud units, and of its angle, degrees; None: two voxels and 2 degrees.
-        second_look: look twice at doubtful pairs as `geomoe3d.register` does; three times as slow, and what
-            triangles say makes up for it.
+        second_look: which doubtful pairs are looked at a second time, as `geomoe3d.register` does, at several times
+            the time: ``between`` groups that are still apart, the most likely; ``all``; or ``none``.
+        optimizer: the library that fits poses to pairs: ``open3d`` or, where it is installed, ``gtsam``.
         e57: write ``groupN.e57`` too: all points of all scans, each scan with its pose.
         progress: called with (pairs done, pairs in all so far proposed); None shows a bar when it takes long, False
             shows nothing.
@@ -96,11 +102,17 @@ def register_scans(
         InputError: fewer than two usable scans, an unknown choice of pairs, more workers than fit, or a
             folder that holds pairs of another configuration, scans, or files of the user's under the names
             of the model's own.
-        DependencyError: Dask is not installed, or a worker has other versions.
+        DependencyError: Dask or GTSAM is asked for and not installed, or a worker has other versions.
         OutputError: the folder cannot be written, or another process is writing it; or the cache is a file.
     """
     if pairs not in ("auto", "all", "similar"):
         raise InputError(f"pairs is '{pairs}'; choose auto, all or similar")
+    if second_look not in ("between", "all", "none"):
+        raise InputError(f"second_look is '{second_look}'; choose between, all or none")
+    if optimizer not in ("open3d", "gtsam"):
+        raise InputError(f"optimizer is '{optimizer}'; choose open3d or gtsam")
+    if optimizer == "gtsam":
+        require_gtsam()
     if neighbors < 1:
         raise InputError(f"neighbors is {neighbors}, at least 1 pair per scan must be proposed")
     if initial_error is not None and not min(initial_error) > 0:
@@ -120,10 +132,9 @@ def register_scans(
     stored = None if fresh else _stored_voxel_size(folder / "pairs")
     clock("look at the scans")
     given = None if initial is None else read_poses(initial, [scan.name for scan in found])
-    config = resolved(config)
-    if not second_look:
-        config = _looked_at_once(config)
-    config, unusable = _with_voxel_size(config, stored, found)
+    config, unusable = _with_voxel_size(resolved(config), stored, found)
+    twice = _changed_look(config, mirror=False)
+    config = twice if second_look == "all" else _changed_look(twice, **_ONCE)
     poses = None
     if given is not None:
         shift, turn = initial_error or (_INITIAL_SHIFT * float(config.voxel_size or 0.0), _INITIAL_TURN_DEG)
@@ -131,14 +142,23 @@ def register_scans(
     store = BatchStore(folder / "pairs", config, fresh=fresh)
     if store.begins:
         _try_out(labour, found, Settings.of(config, labour.cache) if fresh else None)
-    survey = Survey(found, config, store, labour, progress or None, say, sequence=sequence, initial=poses)
+    again = None
+    if second_look == "between" and twice != config:
+        again = Looks(twice, BatchStore(store.folder / AGAIN_FOLDER, twice, fresh=fresh))
+    survey = Survey(
+        found, config, store, labour, progress or None, say,
+        sequence=sequence, initial=poses, again=again, optimizer=optimizer,
+    )  # fmt: skip
     survey.describe(unusable)
     store.begin()
+    if fresh and again is not None:
+        remove_batch(again.store.folder)
     if fresh:
         remove_model(folder)
     clock("register pairs")
     everything = pairs == "all" or (pairs == "auto" and len(found) <= ALL_PAIRS_UP_TO)
     survey.register(survey.first_pairs(everything, neighbors))
+    survey.look_again(survey.known_second_pairs())
     assembly = Assembly(survey)
     clock("group scans")
     groups = assembly.groups()
@@ -150,6 +170,12 @@ def register_scans(
         survey.register(more)
         clock("group scans")
         groups = assembly.groups()
+        doubtful = survey.second_pairs(groups)
+        if doubtful:
+            clock(f"round {count + 1}: look again at {len(doubtful)} doubtful pairs between groups")
+            survey.look_again(doubtful)
+            clock("group scans")
+            groups = assembly.groups()
     for count in range(min(rounds, _MAP_ROUNDS)):
         maps = survey.map_pairs(groups, assembly.edges)
         if not maps:
@@ -195,10 +221,9 @@ def _with_voxel_size(
     return build_config(RegistrationConfig, tree), unusable
 
 
-def _looked_at_once(config: RegistrationConfig) -> RegistrationConfig:
-    """The configuration without second looks at doubtful pairs."""
-    alone = {"descriptor": "none", "grids": (), "max_correspondences": 0, "mirror": False}
-    look = {**config.second_look.model_dump(), **alone}
+def _changed_look(config: RegistrationConfig, **changed: Any) -> RegistrationConfig:
+    """The configuration with other settings of the second look."""
+    look = {**config.second_look.model_dump(), **changed}
     return build_config(RegistrationConfig, {**config.model_dump(), "second_look": look})
 
 

@@ -6,16 +6,14 @@ it; surfaces do not, so poses are laid on them before edges are judged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 from geomoe3d.multiway.edges import Edge, Shape, agrees, expected_error, predicted_motion
-from geomoe3d.multiway.grouping import Group, GroupingRules, Poses
+from geomoe3d.multiway.grouping import Align
 from geomoe3d.multiway.pose_graph import optimise
+from geomoe3d.multiway.rules import Group, GroupingRules, Poses
 
 _MOST_ROUNDS = 6
-
-Align = Callable[[Poses], Poses]
-"""Poses to better poses, by the surfaces of the scans."""
 
 
 def settle(
@@ -50,7 +48,7 @@ def settle(
         near = found
         if len(connected_parts(poses, near)) > 1:
             break
-        poses = optimise(poses, near, rules.tolerance)
+        poses = optimise(poses, near, rules.tolerance, library=rules.optimizer)
     if align is not None and len(poses) > 1 and len(connected_parts(poses, near)) == 1:
         poses = align(poses)
         near = _near(inside, poses, shapes, rules)

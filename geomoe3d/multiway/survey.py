@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +21,15 @@ from geomoe3d.config import RegistrationConfig
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.alignment import Surface
+from geomoe3d.multiway.doubtful import PairKey, doubtful_pairs
 from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
 from geomoe3d.multiway.free_space import FreeSpace
-from geomoe3d.multiway.grouping import Group, GroupingRules
 from geomoe3d.multiway.initial import InitialPoses
 from geomoe3d.multiway.maps import MAPS_FOLDER, MapPair, map_pairs, write_map
 from geomoe3d.multiway.overlaps import Overlaps
+from geomoe3d.multiway.pose_graph import Library
 from geomoe3d.multiway.proposals import most_similar, scan_similarity
+from geomoe3d.multiway.rules import Group, GroupingRules
 from geomoe3d.multiway.scans import Scan, natural_key
 from geomoe3d.registration import Registrar
 from geomoe3d.runtime.journal import read_journal
@@ -43,8 +46,12 @@ _GUESSED_OVERLAP = 0.1
 _ODOMETRY_CONFIDENCE = 0.9
 _ODOMETRY_POINTS = 100.0  # matched points that a given pose counts as, where registered pairs have a thousand
 
-PairKey = tuple[int, int]
-"""A pair of scans by their numbers, the smaller first; which of them is the source is told by the edge."""
+
+class Looks(NamedTuple):
+    """One way to look at pairs: how they are registered, and where the answers are kept."""
+
+    config: RegistrationConfig
+    store: BatchStore
 
 
 class Survey:
@@ -62,9 +69,13 @@ class Survey:
         say: called with sentences on what begins.
         sequence: whether the scans are given in the order in which they were taken.
         initial: poses of all scans from elsewhere, as of odometry; implies a sequence.
+        again: how doubtful pairs are looked at a second time; None: they are not.
+        optimizer: the library that fits poses to edges.
 
     Attributes:
-        scans, config, store, labour, progress, say, sequence, initial: as given.
+        scans, config, labour, progress, say, sequence, initial, again: as given.
+        once: how pairs are looked at first.
+        looked_again: pairs that were looked at a second time.
         voxel_size: edge of the common grid.
         rules: when groups are joined and edges kept.
         unusable: why a scan cannot be registered, by number.
@@ -90,13 +101,16 @@ class Survey:
         *,
         sequence: bool = False,
         initial: InitialPoses | None = None,
+        again: Looks | None = None,
+        optimizer: Library = "open3d",
     ) -> None:
-        self.scans, self.config, self.store, self.labour = scans, config, store, labour
+        self.scans, self.config, self.labour = scans, config, labour
+        self.once, self.again = Looks(config, store), again
         self.progress, self.say = progress, say
         self.sequence, self.initial = sequence or initial is not None, initial
         self.voxel_size = float(config.voxel_size or 0.0)
         tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE, _KEPT_ERROR)
-        self.rules = GroupingRules(*(tolerance * self.voxel_size for tolerance in tolerances))
+        self.rules = GroupingRules(*(t * self.voxel_size for t in tolerances), optimizer=optimizer)
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
         self.surfaces: dict[int, Surface] = {}
@@ -106,6 +120,7 @@ class Survey:
         self.outcomes: dict[PairKey, Outcome] = {}
         self.edges: dict[PairKey, Edge] = {}
         self.map_edges: dict[str, Edge] = {}
+        self.looked_again: set[PairKey] = set()
 
     # ---- the scans by themselves
 
@@ -163,12 +178,12 @@ class Survey:
             neighbors: otherwise so many per scan, but none between scans that have pairs already.
         """
         usable = self.usable()
-        known = self._known()
+        known = self._known(self.once)
+        settled = {scan for pair in known for scan in pair}
         if self.sequence:
             known |= {key_of(i, j) for i, j in pairwise(usable) if j == i + 1}
         if everything:
             return sorted({(i, j) for j in usable for i in usable if i < j})
-        settled = {scan for pair in self._known() for scan in pair}
         wanted = set(known)
         for scan in usable:
             for other in most_similar(self.similarity, scan, usable, neighbors):
@@ -222,11 +237,33 @@ class Survey:
         usable = [group for group in groups if set(group.poses) <= self.surfaces.keys()]
         return map_pairs(usable, edges, self.similarity, self.overlaps, sequence=self.sequence)
 
-    def _known(self) -> set[PairKey]:
-        """Pairs in the journal whose scans and files are the same today."""
+    def second_pairs(self, groups: list[Group]) -> list[PairKey]:
+        """Pairs between groups that are worth a second look and have not had it.
+
+        Args:
+            groups: as they stand, the largest first.
+        """
+        if self.again is None:
+            return []
+
+        def confidence(pair: PairKey) -> float | None:
+            outcome = self.outcomes.get(pair)
+            if pair in self.looked_again or (outcome is not None and outcome.status == "ok"):
+                return None
+            return 0.0 if outcome is None else outcome.confidence
+
+        usable = self.usable()
+        return doubtful_pairs(groups, usable, self.similarity, confidence, sequence=self.sequence)
+
+    def known_second_pairs(self) -> list[PairKey]:
+        """Pairs that an earlier call looked at a second time."""
+        return [] if self.again is None else sorted(self._known(self.again))
+
+    def _known(self, looks: Looks) -> set[PairKey]:
+        """Pairs in a journal whose scans and files are the same today."""
         number = {self._row((i, j)).id: (i, j) for j in self.usable() for i in self.usable() if i < j}
         known = set()
-        for record in read_journal(self.store.folder / JOURNAL_FILE):
+        for record in read_journal(looks.store.folder / JOURNAL_FILE):
             pair = number.get(str(record.get("id")))
             if pair is not None and record.get("fingerprint") == self._row(pair).fingerprint():
                 known.add(pair)
@@ -257,23 +294,39 @@ class Survey:
 
     def register(self, pairs: list[PairKey]) -> None:
         """Register what is missing of the pairs."""
-        rows = {pair: self._row(pair) for pair in pairs if pair not in self.outcomes}
-        if not rows:
-            return
+        self._take(self.once, {pair: self._row(pair) for pair in pairs if pair not in self.outcomes})
+
+    def look_again(self, pairs: list[PairKey]) -> None:
+        """Register pairs with a second look, whose answers take the place of the first."""
+        if self.again is not None:
+            self._take(self.again, {pair: self._row(pair) for pair in pairs})
+            self.looked_again |= set(pairs)
+
+    def _take(self, looks: Looks, rows: dict[PairKey, PairRow]) -> None:
+        """Outcomes and edges of pairs, registered where that is missing."""
+        outcomes = self._registered(looks, rows.values())
+        for pair, row in rows.items():
+            self.outcomes[pair] = outcomes[row.id]
+            edge = edge_of(outcomes[row.id], *self._ends(pair), self.shapes)
+            if edge is None:
+                self.edges.pop(pair, None)
+            else:
+                self.edges[pair] = edge
+
+    def _registered(self, looks: Looks, rows: Iterable[PairRow]) -> dict[str, Outcome]:
+        """Outcomes by the id of the row."""
+        unique = {row.id: row for row in rows}
+        if not unique:
+            return {}
         records, _ = work(
-            list(rows.values()),
-            self.store,
-            self.config,
+            list(unique.values()),
+            looks.store,
+            looks.config,
             self.labour,
             progress=self._count() or False,
             say=self.say,
         )
-        for pair, row in rows.items():
-            outcome = self.store.outcome(records[row.id])
-            self.outcomes[pair] = outcome
-            edge = edge_of(outcome, *self._ends(pair), self.shapes)
-            if edge is not None:
-                self.edges[pair] = edge
+        return {name: looks.store.outcome(records[name]) for name in unique}
 
     def _count(self) -> Callable[[int, int], None] | None:
         """Progress of one round, told as that of all pairs so far proposed."""
@@ -291,7 +344,7 @@ class Survey:
             source, target = (
                 str(
                     write_map(
-                        self.store.folder / MAPS_FOLDER,
+                        self.once.store.folder / MAPS_FOLDER,
                         members,
                         home[members[0]],
                         self.surfaces,
@@ -301,18 +354,10 @@ class Survey:
                 for members in pair.members
             )
             rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
-        unique = {row.id: row for row in rows.values()}
-        records, _ = work(
-            list(unique.values()),
-            self.store,
-            self.config,
-            self.labour,
-            progress=self._count() or False,
-            say=self.say,
-        )
+        outcomes = self._registered(self.again or self.once, rows.values())
         for number, row in rows.items():
-            pair, outcome = pairs[number], self.store.outcome(records[row.id])
-            edge = edge_of(outcome, pair.source, pair.target, frames)
+            pair = pairs[number]
+            edge = edge_of(outcomes[row.id], pair.source, pair.target, frames)
             if edge is not None:
                 self.map_edges[row.id] = replace(edge, of_maps=True)
 

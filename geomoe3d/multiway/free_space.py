@@ -19,6 +19,7 @@ from geomoe3d.types import FloatArray
 _SAMPLE = 300
 _USUAL = 0.01
 _AGAINST = 10.0  # per share of a scan that another saw through beyond that
+_ANEW = 10.0  # of a scan's points, over all pairs, that say something of their own; the rest repeats it
 _MOST_FOR = 2.0
 _HALF_SEEN = 5.0  # of a scan's points, over all pairs, for half of what can be said for a motion
 _MARGIN = 3.0  # voxels in front of what a sensor saw: scans are bent, poses not exact
@@ -79,9 +80,11 @@ class FreeSpace:
 def told_by(seen: float, through: float) -> float:
     """Log-odds that a motion between two groups is right, by what `FreeSpace.between` gives.
 
-    A hundredth of what is seen may be seen through: scans are bent and poses not exact.
+    A hundredth of what is seen may be seen through: scans are bent and poses not exact. Between large groups the same
+    bend is seen many times over, so there the share counts: of right joints in a scene of bent scans 2 to 4 %, of wrong
+    ones 6 to 13 %.
     """
-    excess = through - _USUAL * seen
+    excess = (through - _USUAL * seen) / max(seen / _ANEW, 1.0)
     if excess > 0:
         return -_AGAINST * excess
     return _MOST_FOR * seen / (seen + _HALF_SEEN) * (1 - through / max(_USUAL * seen, 1e-9))

@@ -162,8 +162,8 @@ def register_scans(
     assembly = Assembly(survey)
     clock("group scans")
     groups = assembly.groups()
-    for count in range(rounds):  # twice as many in every round: what hangs together early costs little
-        more = survey.further_pairs(groups, neighbors * 2**count, closing=count == 0)
+    for count in range(rounds):
+        more = survey.further_pairs(groups, neighbors, closing=count == 0)
         if not more:
             break
         clock(f"round {count + 1} of at most {rounds}: register {len(more)} further pairs")

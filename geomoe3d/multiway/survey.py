@@ -354,7 +354,7 @@ class Survey:
                 for members in pair.members
             )
             rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
-        outcomes = self._registered(self.again or self.once, rows.values())
+        outcomes = self._registered(self.once, rows.values())
         for number, row in rows.items():
             pair = pairs[number]
             edge = edge_of(outcomes[row.id], pair.source, pair.target, frames)

@@ -16,12 +16,13 @@ import numpy as np
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.alignment import align_groups, align_scans
 from geomoe3d.multiway.cycles import with_cycles
+from geomoe3d.multiway.doubtful import PairKey
 from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
 from geomoe3d.multiway.grouping import Growth, largest_first, reconsidered
 from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.multiway.settling import settle
-from geomoe3d.multiway.survey import PairKey, Survey, key_of
+from geomoe3d.multiway.survey import Survey, key_of
 from geomoe3d.types import FloatArray
 
 _MOST_TURNS = 3

@@ -132,8 +132,8 @@ class Growth:
             if not free[best]:
                 break
             mine = np.flatnonzero(agreeing[best] & free)
-            voices = float(total[best])
-            found.append(Motion(motions[best], [edges[k] for k in mine], voices, voices))
+            worth_of_all = float(total[best])
+            found.append(Motion(motions[best], [edges[k] for k in mine], worth_of_all, worth_of_all))
             free[mine] = False
         return found
 
@@ -185,7 +185,8 @@ class Growth:
         joint = [*best.supporters, *fitting]
         near = [self._around(group.poses, joint) for group in (one, other)]
         aligned = self._align({k: poses[k] for part in near for k in part})
-        _, told = self._witness(*({k: aligned[k] for k in part} for part in near), np.eye(4))
+        here, there = ({k: aligned[k] for k in part} for part in near)
+        _, told = self._witness(here, there, np.eye(4))
         if len(aligned) == len(poses):
             poses = aligned
         rivals = [way for way in ways[1:] if not ids & {id(edge) for edge in way.supporters}]

@@ -36,10 +36,7 @@ from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray
 
-_TOLERANCE = 4.0  # voxels; see GroupingRules
-_NEAR_TOLERANCE = 2.5
-_KEPT_TOLERANCE = 1.5
-_KEPT_ERROR = 3.0
+_TOLERANCES = (4.0, 2.5, 1.5, 3.0)  # voxels; of GroupingRules, in its order
 _CLOSING_OVERLAP = 0.3
 _CLOSING_PER_SCAN = 1
 _GUESSED_OVERLAP = 0.1
@@ -109,8 +106,8 @@ class Survey:
         self.progress, self.say = progress, say
         self.sequence, self.initial = sequence or initial is not None, initial
         self.voxel_size = float(config.voxel_size or 0.0)
-        tolerances = (_TOLERANCE, _NEAR_TOLERANCE, _KEPT_TOLERANCE, _KEPT_ERROR)
-        self.rules = GroupingRules(*(t * self.voxel_size for t in tolerances), optimizer=optimizer)
+        joined, near, kept, error = np.array(_TOLERANCES) * self.voxel_size
+        self.rules = GroupingRules(joined, near, kept, error, optimizer=optimizer)
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
         self.surfaces: dict[int, Surface] = {}

@@ -37,6 +37,7 @@ KINDS = {
         "visual/*:* cli/*:* batch/page.py:* batch/table.py:* evaluation/report_*:* multiway/page.py:*",
         "multiway/merged.py:_UNKNOWN runtime/progress.py:* evaluation/summary.py:*",
     ),
+    "that an option of a verb sets, named in its help": ("multiway/defaults.py:*",),
     "of memory and time, by which the same answer is had: blocks, chunks, caches": (
         "*:*BLOCK *:*CHUNK* *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE *:_KEPT_CLOUDS *:_KEPT_FEATURES",
         "batch/memory.py:* features/cache.py:* runtime/*:* evaluation/tracks.py:_HASHED_BYTES networks/*:_PARTS",

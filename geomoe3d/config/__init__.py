@@ -3,7 +3,7 @@
 `sections` holds what a user may want to change, part by part, `expert` every other number that decides an answer.
 """
 
-from geomoe3d.config.expert import ExpertConfig, expert, expert_in_force, in_force
+from geomoe3d.config.expert import ExpertConfig, expert, expert_in_force, expert_of_argument, in_force
 from geomoe3d.config.reading import build_config, known_keys, load_config, read_yaml, set_keys
 from geomoe3d.config.section import Section
 from geomoe3d.config.sections import (
@@ -37,6 +37,7 @@ __all__ = [
     "build_config",
     "expert",
     "expert_in_force",
+    "expert_of_argument",
     "in_force",
     "known_keys",
     "load_config",

@@ -25,6 +25,7 @@ from geomoe3d.config.expert_decision import (
     SimilarityExpert,
 )
 from geomoe3d.config.expert_maps import LocatingExpert, MapsExpert, PlacesExpert
+from geomoe3d.config.expert_multiway import ManyGroupsExpert, ManyPairsExpert, ManyPosesExpert
 from geomoe3d.config.expert_proposing import (
     CorrespondencesExpert,
     FeaturesExpert,
@@ -66,6 +67,9 @@ class ExpertConfig(Section):
     preparation: PreparationExpert = PreparationExpert()
     viewpoint: ViewpointExpert = ViewpointExpert()
     scatter: ScatterExpert = ScatterExpert()
+    many_pairs: ManyPairsExpert = ManyPairsExpert()
+    many_groups: ManyGroupsExpert = ManyGroupsExpert()
+    many_poses: ManyPosesExpert = ManyPosesExpert()
 
 
 _IN_FORCE: ContextVar[ExpertConfig] = ContextVar("expert constants in force")
@@ -85,6 +89,19 @@ def in_force(constants: ExpertConfig) -> Iterator[None]:
         yield
     finally:
         _IN_FORCE.reset(token)
+
+
+def expert_of_argument(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of a function with a keyword ``config``, a `RegistrationConfig` or None: inside, its constants are in
+    force."""
+
+    @wraps(function)
+    def inside(*args: P.args, **kwargs: P.kwargs) -> R:
+        config: Any = kwargs.get("config")
+        with in_force(_DEFAULTS if config is None else config.expert):
+            return function(*args, **kwargs)
+
+    return inside
 
 
 class _Configured(Protocol):

@@ -16,21 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import cross_matrix, inverse, make_transform, project_to_so3, transform_points
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
-
-_NUM_POINTS = 500  # of each scan, asked about each neighbour
-_LEAST_OVERLAP = 0.1
-_REACHES = (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5)  # voxels; one step each
-_GROUP_REACHES = (5.0, 4.0, 3.0, 3.0, 2.0, 2.0)  # of two groups that are laid on each other
-_MOST_PAIRS = 30  # of scans, asked for two groups
-_NEIGHBORS_AGAIN = 5  # the step before which it is asked again who overlaps whom
-_SCALE = 1 / 3  # of the reach: a gap this large counts a quarter
-_LEAST_COSINE = 0.7
-_DAMPING = 1e-3  # of the mean curvature: what no surface holds stays where it was
 
 
 @dataclass(frozen=True)
@@ -77,14 +68,15 @@ def align_scans(
     from scipy.spatial import cKDTree
 
     scans = sorted(poses)
-    chosen = {k: drawn_rows(surfaces[k].points, voxel_size, _NUM_POINTS, seed) for k in scans}
+    most = expert().many_poses.num_points
+    chosen = {k: drawn_rows(surfaces[k].points, voxel_size, most, seed) for k in scans}
     trees = {k: cKDTree(surfaces[k].points) for k in scans}
     centers = {k: surfaces[k].points.mean(0) for k in scans}
     radius = float(np.median([np.sqrt(surfaces[k].points.var(0).sum()) for k in scans]))
     current = {k: np.array(poses[k]) for k in scans}
     pairs: list[tuple[int, int]] = []
-    for number, reach in enumerate(_REACHES):
-        if number in (0, _NEIGHBORS_AGAIN):
+    for number, reach in enumerate(expert().many_poses.reaches):
+        if number in (0, expert().many_poses.neighbors_again):
             pairs = _overlapping(current, overlaps)
         about = {k: transform_points(current[k], centers[k][None])[0] for k in scans}
         system = _System(scans, {k: _lever(about[k], radius) for k in scans})
@@ -125,11 +117,15 @@ def align_groups(
         for j in b
         if i in surfaces and j in surfaces
     ]
-    pairs = [(i, j) for o, i, j in sorted(shared, reverse=True)[:_MOST_PAIRS] if o >= _LEAST_OVERLAP]
+    known = expert().many_poses
+    pairs = [
+        (i, j) for o, i, j in sorted(shared, reverse=True)[: known.most_pairs] if o >= known.least_overlap
+    ]
     trees = {i: cKDTree(surfaces[i].points) for i in {i for i, _ in pairs}}
-    chosen = {j: drawn_rows(surfaces[j].points, voxel_size, _NUM_POINTS) for j in {j for _, j in pairs}}
+    asked = {j for _, j in pairs}
+    chosen = {j: drawn_rows(surfaces[j].points, voxel_size, known.num_points) for j in asked}
     T = T_a_b
-    for reach in _GROUP_REACHES if pairs else ():
+    for reach in known.group_reaches if pairs else ():
         A, slope = np.zeros((6, 6)), np.zeros(6)
         about = np.mean(
             [transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for _, j in pairs], axis=0
@@ -141,7 +137,7 @@ def align_groups(
             )  # fmt: skip
             A += lever.T @ one @ lever
             slope += lever.T @ two
-        damping = _DAMPING * float(np.trace(A)) / 6
+        damping = expert().many_poses.damping * float(np.trace(A)) / 6
         if damping <= 0:
             break
         step: FloatArray = np.linalg.solve(A + damping * np.eye(6), slope).astype(np.float64)
@@ -183,7 +179,7 @@ class _System:
         values = np.array(list(self._blocks.values())).reshape(-1, 6, 6)
         where = (6 * keys[:, 0, None, None] + rows).ravel(), (6 * keys[:, 1, None, None] + columns).ravel()
         H = coo_matrix((values.ravel(), where), shape=(count, count)).tocsc()
-        damping = _DAMPING * float(H.diagonal().mean())
+        damping = expert().many_poses.damping * float(H.diagonal().mean())
         if damping <= 0:  # nothing overlaps
             return {}
         found = spsolve(H + damping * identity(count, format="csc"), self._slope.ravel()).reshape(-1, 6)
@@ -200,7 +196,8 @@ def _overlapping(poses: Mapping[int, FloatArray], overlaps: Overlaps) -> list[tu
         for source in poses
         for target in poses
         if source != target
-        and overlaps.of(source, target, inverse(poses[target]) @ poses[source]) >= _LEAST_OVERLAP
+        and overlaps.of(source, target, inverse(poses[target]) @ poses[source])
+        >= expert().many_poses.least_overlap
     ]
 
 
@@ -229,9 +226,9 @@ def _pull(
     nearest = nearest[hit]
     normals = target.normals[nearest]
     cosine = np.einsum("ij,ij->i", source.normals[chosen[hit]] @ T_target_source[:3, :3].T, normals)
-    alike = (cosine if source.signed and target.signed else np.abs(cosine)) > _LEAST_COSINE
+    alike = (cosine if source.signed and target.signed else np.abs(cosine)) > expert().many_poses.least_cosine
     gaps = np.einsum("ij,ij->i", moved[hit] - target.points[nearest], normals)
-    square = (_SCALE * reach) ** 2
+    square = (expert().many_poses.gap_scale * reach) ** 2
     weights = np.where(alike, (square / (square + gaps**2)) ** 2, 0.0)
     points, normals = transform_points(T_target, moved[hit]), normals @ T_target[:3, :3].T
     J = np.hstack([np.cross(points, normals), normals])

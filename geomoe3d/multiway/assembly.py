@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.alignment import align_groups, align_scans
 from geomoe3d.multiway.cycles import with_cycles
@@ -24,13 +25,6 @@ from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.multiway.settling import settle
 from geomoe3d.multiway.survey import Survey, key_of
 from geomoe3d.types import FloatArray
-
-_MOST_TURNS = 3
-_SILENCE = ((0.3, 2.5), (0.2, 1.0), (0.1, 0.4))
-"""Least overlap both ways, and log-odds against a motion under which a registered pair would overlap so much
-but was registered otherwise. Of pairs that overlap by 0.3, 0.2 and 0.1 and more 98, 87 and 66 % are right."""
-_SHARED_SILENCE = 0.5  # what makes one pair fail makes its neighbours fail
-_IN_SEQUENCE = 3.0  # log-odds that scans taken one after the other overlap, beyond what others have
 
 
 class Assembly:
@@ -58,7 +52,7 @@ class Assembly:
         self.edges = edges
         told = edges, survey.shapes, survey.rules
         groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
-        for turn in range(_MOST_TURNS):
+        for turn in range(expert().many_groups.most_turns):
             grown = Growth(groups, *told, self.witness, self.align).run()
             if turn and len(grown) == len(groups):
                 break
@@ -83,7 +77,8 @@ class Assembly:
                 rivals[same] = edge
         edges = [edge for rivals in known.values() for edge in rivals]
         if survey.sequence:
-            edges = [replace(e, expected=_IN_SEQUENCE) if abs(e.source - e.target) == 1 else e for e in edges]
+            likely = expert().many_groups.in_sequence
+            edges = [replace(e, expected=likely) if abs(e.source - e.target) == 1 else e for e in edges]
         return with_cycles(edges, survey.shapes, survey.rules.tolerance, survey.rules.turn_deg)
 
     def _alike(self, one: Edge, other: Edge) -> bool:
@@ -109,7 +104,8 @@ class Assembly:
             a, b, T_a_b, self._survey.surfaces, self._survey.overlaps, self._survey.voxel_size
         )
         silent = sum(self._silence(i, j, inverse(a[i]) @ T_a_b @ b[j]) for i, j in self._tried_between(a, b))
-        return T_a_b, told_by(*self._survey.free_space.between(a, b, T_a_b)) - _SHARED_SILENCE * silent
+        told = told_by(*self._survey.free_space.between(a, b, T_a_b))
+        return T_a_b, told - expert().many_groups.shared_silence * silent
 
     def _tried_between(
         self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray]
@@ -120,7 +116,8 @@ class Assembly:
     def _silence(self, i: int, j: int, T_i_j: FloatArray) -> float:
         """Log-odds against a motion by a pair that would overlap under it, but was registered otherwise."""
         overlap = min(self._survey.overlaps.of(j, i, T_i_j), self._survey.overlaps.of(i, j, inverse(T_i_j)))
-        told = next((odds for least, odds in _SILENCE if overlap >= least), 0.0)
+        known = zip(expert().many_groups.silent_overlaps, expert().many_groups.silent_odds, strict=True)
+        told = next((odds for least, odds in known if overlap >= least), 0.0)
         edge = self._survey.edges.get(key_of(i, j))
         if told == 0.0 or edge is None:
             return told

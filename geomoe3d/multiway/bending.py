@@ -12,13 +12,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.multiway.edges import Edge, Shape, agrees, predicted_motion
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.rules import Group, GroupingRules, Poses
 from geomoe3d.types import FloatArray
-
-_TRIANGLE = 3  # pairs of the loop for which the tolerance of the rules is meant
-_MOST_STRAINED = 0.1  # of a group's own edges, that may leave the poses as it is unbent
 
 
 def unbend(
@@ -55,7 +53,8 @@ def unbend(
         if len(kept) == len(fitting):
             strained = sum(not _near(e, poses, shapes, rules) for e in own if _near(e, start, shapes, rules))
             held = all(_near(edge, poses, shapes, rules) for edge in supporters)
-            return (poses, fitting) if held and strained <= _MOST_STRAINED * len(own) else (start, [])
+            most = expert().many_poses.most_strained * len(own)
+            return (poses, fitting) if held and strained <= most else (start, [])
         fitting = kept
         if not fitting:
             break
@@ -73,7 +72,7 @@ def _drifted(
 ) -> bool:
     """Whether an edge is off the poses by no more than a loop of its length may be."""
     loop = 2 + away.get(edge.source, 0) + away.get(edge.target, 0)
-    wider = float(np.sqrt(max(loop / _TRIANGLE, 1.0)))
+    wider = float(np.sqrt(max(loop / expert().many_poses.triangle, 1.0)))
     predicted = predicted_motion(edge.source, edge.target, poses)
     limits = wider * rules.tolerance, wider * rules.turn_deg
     return agrees(predicted, edge.T_target_source, shapes[edge.source], *limits)

@@ -15,17 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.types import BoolArray, FloatArray, IntArray
-
-_MISSED = 0.1  # triangles of right edges that do not close: bent scans, loosely held ones
-_BY_CHANCE = 0.02  # triangles with a wrong edge that close all the same
-_SHARE = 0.5  # of what triangles say: scans of one place are deceived alike
-_MOST_TOLD = 8.0  # log-odds: no edge is certain to its neighbours
-_ROUNDS = 10
-_DAMPING = 0.5
-_LEAST_CONFIDENCE = 0.02  # edges below take no part
 
 
 def with_cycles(
@@ -39,7 +32,8 @@ def with_cycles(
         tolerance: largest displacement at which a triangle closes, cloud units.
         turn_deg: its largest turn.
     """
-    voices = [k for k, edge in enumerate(edges) if edge.confidence >= _LEAST_CONFIDENCE]
+    known = expert().many_groups
+    voices = [k for k, edge in enumerate(edges) if edge.confidence >= known.least_confidence]
     heard = [edges[k] for k in voices]
     triangles = find_triangles(heard)
     evidence = np.zeros(len(edges))
@@ -101,15 +95,17 @@ def propagate(prior: FloatArray, triangles: IntArray, closed: BoolArray) -> Floa
     """
     messages = np.zeros(triangles.shape)
 
+    known = expert().many_groups
+
     def told() -> FloatArray:
-        sums = np.bincount(triangles.ravel(), _SHARE * messages.ravel(), minlength=len(prior))
+        sums = np.bincount(triangles.ravel(), known.triangle_share * messages.ravel(), minlength=len(prior))
         return sums.astype(np.float64)
 
-    for _ in range(_ROUNDS):
+    for _ in range(known.rounds):
         # What an edge tells a triangle leaves out what that triangle told it.
-        odds = (prior + told())[triangles] - _SHARE * messages
-        likely = 1 / (1 + np.exp(-np.clip(odds, -_MOST_TOLD, _MOST_TOLD)))
-        others = (1 - _MISSED) * np.roll(likely, -1, axis=1) * np.roll(likely, -2, axis=1)
-        fresh = np.where(closed[:, None], np.log1p(others * (1 / _BY_CHANCE - 1)), np.log1p(-others))
-        messages = _DAMPING * messages + (1 - _DAMPING) * fresh
+        odds = (prior + told())[triangles] - known.triangle_share * messages
+        likely = 1 / (1 + np.exp(-np.clip(odds, -known.most_told, known.most_told)))
+        others = (1 - known.missed) * np.roll(likely, -1, axis=1) * np.roll(likely, -2, axis=1)
+        fresh = np.where(closed[:, None], np.log1p(others * (1 / known.by_chance - 1)), np.log1p(-others))
+        messages = known.damping * messages + (1 - known.damping) * fresh
     return told()

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+from geomoe3d.config import expert
 from geomoe3d.multiway.rules import Group
 from geomoe3d.types import FloatArray
-
-_LEAST, _PER_SCAN, _MOST = 4, 2, 16
-"""Pairs of either kind for a group, and more for each of its scans."""
 
 PairKey = tuple[int, int]
 
@@ -41,7 +39,8 @@ def doubtful_pairs(
         crossing = [(min(i, j), max(i, j)) for i in inside for j in outside]
         sure = {pair: confidence(pair) for pair in crossing}
         open_pairs = {pair: value for pair, value in sure.items() if value is not None}
-        count = min(_MOST, _LEAST + _PER_SCAN * len(inside))
+        limits = expert().many_pairs
+        count = min(limits.most_doubtful, limits.least_doubtful + limits.doubtful_per_scan * len(inside))
         likely = sorted(open_pairs, key=lambda pair: (-open_pairs[pair], pair))
         alike = sorted(open_pairs, key=lambda pair: (-similarity[pair], pair))
         wanted |= {pair for pair in likely[:count] if open_pairs[pair] > 0} | set(alike[:count])

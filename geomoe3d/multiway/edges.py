@@ -14,13 +14,10 @@ import numpy as np
 
 from geomoe3d.batch.store import Outcome
 from geomoe3d.clouds.transform_files import has_transform
+from geomoe3d.config import expert
 from geomoe3d.decision.confidence import deviations_at
 from geomoe3d.geometry.se3 import cross_matrix, inverse, rotation_angle_deg, shift_frames, transform_points
 from geomoe3d.types import FloatArray
-
-_MOST_LOG_ODDS = 7.0
-_UNRELATED = 1.0  # the confidence is that of pairs of which most overlap
-_LEAST_OBSERVABILITY = 1e-3  # directions weaker than this share of the strongest are held this much
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,8 @@ class Edge:
     def prior(self) -> float:
         """Log-odds of the confidence among pairs of which most share nothing, at most 7: none is certain."""
         odds = np.clip(self.confidence, 1e-9, 1 - 1e-9)
-        return float(min(np.log(odds / (1 - odds)) - _UNRELATED + self.expected, _MOST_LOG_ODDS))
+        known = expert().many_groups
+        return float(min(np.log(odds / (1 - odds)) - known.unrelated + self.expected, known.most_log_odds))
 
     @property
     def worth(self) -> float:
@@ -102,7 +100,7 @@ def edge_of(
     looseness = float(deviations_at(result.information_matrix, center, sensor)[0])
     information *= matched / max(float(np.trace(result.information_matrix[3:, 3:])), 1e-12)
     # A surface that lets the source slide must not make the graph singular.
-    floor = _LEAST_OBSERVABILITY * matched
+    floor = expert().many_groups.least_observability * matched
     radius_squared = max(float(np.trace(shapes[source].spread)), 1e-12)
     information += floor * np.diag([radius_squared] * 3 + [1.0] * 3)
     return Edge(source, target, T, result.confidence, information, looseness)

@@ -12,17 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.config import expert
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import FloatArray
-
-_SAMPLE = 300
-_USUAL = 0.01
-_AGAINST = 10.0  # per share of a scan that another saw through beyond that
-_ANEW = 10.0  # of a scan's points, over all pairs, that say something of their own; the rest repeats it
-_MOST_FOR = 2.0
-_HALF_SEEN = 5.0  # of a scan's points, over all pairs, for half of what can be said for a motion
-_MARGIN = 3.0  # voxels in front of what a sensor saw: scans are bent, poses not exact
 
 
 class FreeSpace:
@@ -43,9 +36,10 @@ class FreeSpace:
         *,
         seed: int = 0,
     ) -> None:
-        self._sample = {k: p[drawn_rows(p, voxel_size, _SAMPLE, seed)] for k, p in points.items()}
+        most = expert().many_groups.seen_sample
+        self._sample = {k: p[drawn_rows(p, voxel_size, most, seed)] for k, p in points.items()}
         self._views = {k: RangeImage.of(points[k], sensor) for k, sensor in sensors.items()}
-        self._margin = _MARGIN * voxel_size
+        self._margin = expert().many_groups.seen_margin * voxel_size
 
     def between(
         self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray], T_a_b: FloatArray
@@ -72,8 +66,8 @@ class FreeSpace:
         for k, T in sensors.items():
             if k in self._views:
                 sees, margins = self._views[k].margins(transform_points(inverse(T), points))
-                seen += float(sees.sum()) / _SAMPLE
-                through += float((margins < -self._margin).sum()) / _SAMPLE
+                seen += float(sees.sum()) / expert().many_groups.seen_sample
+                through += float((margins < -self._margin).sum()) / expert().many_groups.seen_sample
         return seen, through
 
 
@@ -84,7 +78,8 @@ def told_by(seen: float, through: float) -> float:
     bend is seen many times over, so there the share counts: of right joints in a scene of bent scans 2 to 4 %, of wrong
     ones 6 to 13 %.
     """
-    excess = (through - _USUAL * seen) / max(seen / _ANEW, 1.0)
+    known = expert().many_groups
+    excess = (through - known.usual * seen) / max(seen / known.anew, 1.0)
     if excess > 0:
-        return -_AGAINST * excess
-    return _MOST_FOR * seen / (seen + _HALF_SEEN) * (1 - through / max(_USUAL * seen, 1e-9))
+        return -known.against * excess
+    return known.most_for * seen / (seen + known.half_seen) * (1 - through / max(known.usual * seen, 1e-9))

@@ -13,19 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.bending import unbend
 from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.rules import Group, GroupingRules, Poses
 from geomoe3d.types import BoolArray, FloatArray
-
-_MOST_MOTIONS = 3  # of two groups that are weighed against each other
-_MOST_PROPOSALS = 60  # edges between two groups whose motions are looked at, the surest
-_MOST_WORTH = 8.0
-_ASKED = 60  # scans of each group that are asked about a motion, the nearest to its edges: bounds the time
-_LEAST_BENT = 3  # scans of a group that may be bent
-_RIVAL = 0.25  # of the worth of the best: a motion that the scans are asked about again
 
 Witness = Callable[[Mapping[int, FloatArray], Mapping[int, FloatArray], FloatArray], tuple[FloatArray, float]]
 """Asked of two groups (poses of each) and a motion T_a_b (4, 4): the motion as the surfaces have it, and the
@@ -109,7 +103,7 @@ class Growth:
         """Of two groups: the ways to join them, weighed, the best first; none if only one is worth a look."""
         for pair in self._between:
             ways = self._motions(*pair)
-            if len(ways) > 1 and ways[1].worth > _RIVAL * ways[0].worth:
+            if len(ways) > 1 and ways[1].worth > expert().many_groups.rival * ways[0].worth:
                 self._ways[pair] = ways
                 self._weigh(*pair)
                 return self._ways[pair]
@@ -119,12 +113,12 @@ class Growth:
         """The ways to join two groups for which most speaks, no two alike, the best first."""
         one, other = self.groups[a], self.groups[b]
         edges = sorted(self._between[a, b], key=lambda e: (-e.worth, e.source, e.target))
-        worth = np.array([min(edge.worth, _MOST_WORTH) for edge in edges])
+        worth = np.array([min(edge.worth, expert().many_groups.most_worth) for edge in edges])
         motions = np.stack([_between_groups(edge, one, other) for edge in edges])
         agreeing = self._agreements(motions, edges, other)
         free = np.ones(len(edges), dtype=np.bool_)
         found: list[Motion] = []
-        while len(found) < _MOST_MOTIONS and free.any():
+        while len(found) < expert().many_groups.most_transforms and free.any():
             voices = np.where(agreeing & free, worth, 0.0)
             surest = voices.max(axis=1)
             total = surest + self._rules.further_share * (voices.sum(axis=1) - surest)
@@ -141,7 +135,7 @@ class Growth:
         """(m, n) True where motion m of the first ones moves the scan of edge n as that edge does."""
         ends = [edge.source if edge.source in b.poses else edge.target for edge in edges]
         poses = np.stack([b.poses[scan] for scan in ends])
-        rows, count = min(len(edges), _MOST_PROPOSALS), len(edges)
+        rows, count = min(len(edges), expert().many_groups.most_proposals), len(edges)
         moved = (motions[:rows, None] @ poses[None]).reshape(-1, 4, 4)
         own = np.tile(motions @ poses, (rows, 1, 1))
         shift, turn = differences(moved, own, [self._shapes[scan] for scan in ends] * rows)
@@ -164,7 +158,12 @@ class Growth:
         found = []
         for (a, b), ways in self._ways.items():
             sizes = [len(self.groups[k].poses) for k in (a, b)]
-            if self._align and min(sizes) >= _LEAST_BENT and len(ways) > 1 and not self._was_unbent(a, b):
+            if (
+                self._align
+                and min(sizes) >= expert().many_groups.least_bent
+                and len(ways) > 1
+                and not self._was_unbent(a, b)
+            ):
                 found.append((-sum(way.voices for way in ways), a, b))
         return [(a, b) for _, a, b in sorted(found)]
 
@@ -179,7 +178,7 @@ class Growth:
         further = [edge for way in ways[1:] for edge in way.supporters]
         poses, fitting = unbend(one, other, best.T_a_b, best.supporters, further, self._shapes, self._rules)
         share, ids = self._rules.further_share, {id(edge) for edge in fitting}
-        voices = best.voices + share * sum(min(e.worth, _MOST_WORTH) for e in fitting)
+        voices = best.voices + share * sum(min(e.worth, expert().many_groups.most_worth) for e in fitting)
         if not fitting or voices < self._rules.joined_worth or self._align is None or self._witness is None:
             return False
         joint = [*best.supporters, *fitting]
@@ -198,12 +197,12 @@ class Growth:
 
     def _around(self, poses: Poses, supporters: Sequence[Edge]) -> Poses:
         """The scans of a group nearest to where some edges end in it: far away, poses have drifted."""
-        if len(poses) <= _ASKED:
+        if len(poses) <= expert().many_groups.asked:
             return poses
         centers = {k: T[:3, :3] @ self._shapes[k].center + T[:3, 3] for k, T in poses.items()}
         ends = np.array([centers[k] for e in supporters for k in (e.source, e.target) if k in poses])
         away = {k: float(np.linalg.norm(ends - c, axis=1).min()) for k, c in centers.items()}
-        return {k: poses[k] for k in sorted(poses, key=lambda k: (away[k], k))[:_ASKED]}
+        return {k: poses[k] for k in sorted(poses, key=lambda k: (away[k], k))[: expert().many_groups.asked]}
 
     def _merged(self, ways: list[Motion], b: int) -> list[Motion]:
         """The ways, the best first, those that the surfaces drew together as one."""

@@ -12,15 +12,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.multiway.pose_graph import spanning_tree
 from geomoe3d.multiway.rules import Poses
 from geomoe3d.types import FloatArray
-
-_LEAST_WORTH = 4.0  # of an edge whose loop is followed: about 0.98
-_SHIFT = 4.0  # voxels, of a loop of three edges; errors add up as the square root of the length
-_TURN_DEG = 8.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,8 @@ def find_loops(poses: Poses, edges: Sequence[Edge], shapes: Sequence[Shape], vox
         shapes: of all scans.
         voxel_size: of the common grid, cloud units.
     """
-    sure = [e for e in edges if {e.source, e.target} <= poses.keys() and e.worth >= _LEAST_WORTH]
+    known = expert().many_groups
+    sure = [e for e in edges if {e.source, e.target} <= poses.keys() and e.worth >= known.loop_worth]
     tree = spanning_tree(sure)
     beside: dict[int, list[tuple[int, Edge]]] = {}
     for edge in sure:
@@ -85,7 +83,9 @@ def _loop(
         T = _step(here, there, up) @ T
     shift, turn = differences(T[None], closing.T_target_source[None], [shapes[closing.source]])
     longer = float(np.sqrt(len(scans) / 3))
-    closes = bool(shift[0] < _SHIFT * longer * voxel_size and turn[0] < _TURN_DEG * longer)
+    known = expert().many_groups
+    near = shift[0] < known.loop_shift * longer * voxel_size
+    closes = bool(near and turn[0] < known.loop_turn_deg * longer)
     return Loop(scans, float(shift[0]), float(turn[0]), closes)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.multiway.alignment import Surface
 from geomoe3d.multiway.edges import Edge
@@ -23,10 +24,6 @@ from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.types import FloatArray
 
 MAPS_FOLDER = "maps"
-_SCANS = 4  # of a map; of eight, what is not shared drowns what is
-_LIKELY = 3  # of two groups, about the surest edges between them
-_PER_TWO_GROUPS = 6
-_MOST = 32  # pairs of maps in one round
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]
     """The scans of the map about a scan: itself, and those of its group that overlap it most."""
     shared = {k: overlaps.of(k, anchor, inverse(poses[anchor]) @ T) for k, T in poses.items() if k != anchor}
     nearest = sorted((k for k in shared if shared[k] > 0), key=lambda k: (-shared[k], k))
-    return anchor, *nearest[: _SCANS - 1]
+    return anchor, *nearest[: expert().many_pairs.map_scans - 1]
 
 
 def map_pairs(
@@ -70,7 +67,7 @@ def map_pairs(
     found: list[MapPair] = []
     known: dict[int, tuple[int, ...]] = {}
     for a, b in combinations(groups, 2):
-        if len(a.poses) + len(b.poses) < 3 or len(found) >= _MOST:
+        if len(a.poses) + len(b.poses) < 3 or len(found) >= expert().many_pairs.most_maps:
             continue
         poses = {**a.poses, **b.poses}
         crossing = [e for e in edges if (e.source in a.poses) != (e.target in a.poses)]
@@ -82,7 +79,9 @@ def map_pairs(
         )
         following = [(i, i + 1) for i in poses if i + 1 in poses and (i in a.poses) != (i + 1 in a.poses)]
         likely = [(e.source, e.target) for e in crossing]
-        lots = (following if sequence else [], _PER_TWO_GROUPS), (likely, _LIKELY), (alike, _PER_TWO_GROUPS)
+        limits = expert().many_pairs
+        each, few = limits.maps_per_groups, limits.map_edges
+        lots = (following if sequence else [], each), (likely, few), (alike, each)
         chosen: list[MapPair] = []
         for lot, limit in lots:
             for source, target in lot:
@@ -97,7 +96,7 @@ def map_pairs(
         chosen = [pair for pair in chosen if max(map(len, pair.members)) > 1]
         for pair in chosen:  # both ways: on so little a second try often finds what the first did not
             found += [pair, MapPair(pair.target, pair.source, pair.members[::-1])]
-    return found[:_MOST]
+    return found[: expert().many_pairs.most_maps]
 
 
 def write_map(

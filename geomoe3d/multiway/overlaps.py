@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray
-
-_SAMPLE = 400
 
 
 class Overlaps:
@@ -24,7 +23,8 @@ class Overlaps:
     """
 
     def __init__(self, points: dict[int, FloatArray], voxel_size: float, *, seed: int = 0) -> None:
-        self._points = {k: p[drawn_rows(p, voxel_size, _SAMPLE, seed)] for k, p in points.items()}
+        most = expert().many_pairs.overlap_sample
+        self._points = {k: p[drawn_rows(p, voxel_size, most, seed)] for k, p in points.items()}
         self._tree = lru_cache(maxsize=None)(self._build)
 
     def of(self, source: int, target: int, T_target_source: FloatArray) -> float:

@@ -13,15 +13,13 @@ from typing import Literal
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.errors import DependencyError
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
 from geomoe3d.multiway.edges import Edge, source_information
 from geomoe3d.types import FloatArray
 
 Library = Literal["open3d", "gtsam"]
-_LOOP_PREFERENCE = 2.0
-_PRUNED_BELOW = 0.25
-_MOST_STEPS = 100
 
 
 def optimise(
@@ -83,8 +81,8 @@ def _by_open3d(
         )
     option = registration.GlobalOptimizationOption(
         max_correspondence_distance=tolerance,
-        edge_prune_threshold=_PRUNED_BELOW,
-        preference_loop_closure=_LOOP_PREFERENCE,
+        edge_prune_threshold=expert().many_poses.pruned_below,
+        preference_loop_closure=expert().many_poses.loop_preference,
         reference_node=0,
     )
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -114,7 +112,8 @@ def _by_gtsam(
     import gtsam
 
     information = [source_information(edge) * edge.confidence for edge in edges]
-    scale = _LOOP_PREFERENCE * tolerance**2 * float(np.mean([matrix[5, 5] for matrix in information]))
+    preference = expert().many_poses.loop_preference
+    scale = preference * tolerance**2 * float(np.mean([matrix[5, 5] for matrix in information]))
     robust = gtsam.noiseModel.mEstimator.GemanMcClure.Create(float(np.sqrt(scale)))
     values = gtsam.Values()
     for scan, T in poses.items():
@@ -134,11 +133,11 @@ def _by_gtsam(
                 loose = gtsam.noiseModel.Robust.Create(robust, model)
                 graph.add(gtsam.BetweenFactorPose3(edge.target, edge.source, measured, loose))
         parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(_MOST_STEPS)
+        parameters.setMaxIterations(expert().many_poses.most_steps)
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
         # Twice the error of a factor without the robust weight is its squared residual.
         weights = {k: (scale / (scale + 2 * factors[k].error(values))) ** 2 for k in used}
-        kept = [k for k in used if id(edges[k]) in certain or weights[k] >= _PRUNED_BELOW]
+        kept = [k for k in used if id(edges[k]) in certain or weights[k] >= expert().many_poses.pruned_below]
         if len(kept) == len(used):
             return {scan: values.atPose3(scan).matrix() for scan in poses}
         used = kept

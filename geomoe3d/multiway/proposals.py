@@ -13,12 +13,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import Float32Array, FloatArray, IntArray
-
-_WORDS = 64
-_SAMPLE = 500  # features of each scan from which the words are found
-_ROUNDS = 12
 
 
 def most_similar(similarity: FloatArray, scan: int, others: Iterable[int], count: int) -> list[int]:
@@ -38,7 +35,8 @@ def most_similar(similarity: FloatArray, scan: int, others: Iterable[int], count
 def scan_similarity(features: Sequence[Float32Array], *, seed: int = 0) -> FloatArray:
     """(K, K) cosine of the scans' descriptors."""
     rng = np.random.default_rng(seed)
-    sample = np.concatenate([f[rng.permutation(len(f))[:_SAMPLE]] for f in features]).astype(np.float64)
+    most = expert().many_pairs.word_sample
+    sample = np.concatenate([f[rng.permutation(len(f))[:most]] for f in features]).astype(np.float64)
     words = _find_words(sample, rng)
     descriptors = np.stack([_describe(f.astype(np.float64), words) for f in features])
     similarity: FloatArray = descriptors @ descriptors.T
@@ -47,8 +45,8 @@ def scan_similarity(features: Sequence[Float32Array], *, seed: int = 0) -> Float
 
 def _find_words(sample: FloatArray, rng: np.random.Generator) -> FloatArray:
     """(W, 33) centres by k-means; a word that loses all its features begins anew at a random one."""
-    words: FloatArray = sample[rng.permutation(len(sample))[:_WORDS]].copy()
-    for _ in range(_ROUNDS):
+    words: FloatArray = sample[rng.permutation(len(sample))[: expert().many_pairs.words]].copy()
+    for _ in range(expert().many_pairs.word_rounds):
         nearest = _nearest(sample, words)
         for k in range(len(words)):
             mine = nearest == k

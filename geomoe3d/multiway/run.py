@@ -19,7 +19,7 @@ from geomoe3d.batch.run import Labour, try_out
 from geomoe3d.batch.store import BatchStore
 from geomoe3d.batch.task import Settings
 from geomoe3d.clouds.formats.e57 import require_pye57
-from geomoe3d.config import RegistrationConfig, build_config
+from geomoe3d.config import RegistrationConfig, build_config, expert, expert_of_argument
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.multiway.assembly import Assembly
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
@@ -35,15 +35,13 @@ from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.timing import StageClock
 
-_MAP_ROUNDS = 2
-_INITIAL_SHIFT = 2.0  # voxels
-_INITIAL_TURN_DEG = 2.0
 _ONCE = {"descriptor": "none", "grids": (), "max_correspondences": 0}  # no second look
 AGAIN_FOLDER = "again"
 """In that of the pairs: those that were looked at a second time."""
 
 
 @shows_progress("pairs")
+@expert_of_argument
 def register_scans(
     scans: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     out: str | os.PathLike[str],
@@ -137,7 +135,9 @@ def register_scans(
     config = twice if second_look == "all" else _changed_look(twice, **_ONCE)
     poses = None
     if given is not None:
-        shift, turn = initial_error or (_INITIAL_SHIFT * float(config.voxel_size or 0.0), _INITIAL_TURN_DEG)
+        limits = expert().many_pairs
+        usual = limits.initial_shift * float(config.voxel_size or 0.0), limits.initial_turn_deg
+        shift, turn = initial_error or usual
         poses = InitialPoses(given, shift, turn)
     store = BatchStore(folder / "pairs", config, fresh=fresh)
     if store.begins:
@@ -176,11 +176,12 @@ def register_scans(
             survey.look_again(doubtful)
             clock("group scans")
             groups = assembly.groups()
-    for count in range(min(rounds, _MAP_ROUNDS)):
+    most = expert().many_pairs.map_rounds
+    for count in range(min(rounds, most)):
         maps = survey.map_pairs(groups, assembly.edges)
         if not maps:
             break
-        clock(f"local maps, round {count + 1} of at most {_MAP_ROUNDS}: register {len(maps)} pairs of them")
+        clock(f"local maps, round {count + 1} of at most {most}: register {len(maps)} pairs of them")
         survey.register_maps(maps, groups)
         clock("group scans")
         known, groups = groups, assembly.groups()

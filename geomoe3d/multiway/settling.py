@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from geomoe3d.config import expert
 from geomoe3d.multiway.edges import Edge, Shape, agrees, expected_error, predicted_motion
 from geomoe3d.multiway.grouping import Align
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.rules import Group, GroupingRules, Poses
-
-_MOST_ROUNDS = 6
 
 
 def settle(
@@ -41,7 +40,7 @@ def settle(
     inside = [e for e in edges if e.source in group.poses and e.target in group.poses]
     inside = [e for e in inside if e.worth > rules.least_worth]
     poses, near = group.poses, group.edges
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(expert().many_poses.most_rounds):
         found = _near(inside, poses, shapes, rules)
         if {id(e) for e in found} == {id(e) for e in near}:
             break

@@ -17,7 +17,7 @@ from geomoe3d.batch.table import PairRow
 from geomoe3d.batch.task import open_cache
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.viewpoint import find_viewpoints
-from geomoe3d.config import RegistrationConfig
+from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.alignment import Surface
@@ -35,13 +35,6 @@ from geomoe3d.registration import Registrar
 from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray
-
-_TOLERANCES = (4.0, 2.5, 1.5, 3.0)  # voxels; of GroupingRules, in its order
-_CLOSING_OVERLAP = 0.3
-_CLOSING_PER_SCAN = 1
-_GUESSED_OVERLAP = 0.1
-_ODOMETRY_CONFIDENCE = 0.9
-_ODOMETRY_POINTS = 100.0  # matched points that a given pose counts as, where registered pairs have a thousand
 
 
 class Looks(NamedTuple):
@@ -106,7 +99,7 @@ class Survey:
         self.progress, self.say = progress, say
         self.sequence, self.initial = sequence or initial is not None, initial
         self.voxel_size = float(config.voxel_size or 0.0)
-        joined, near, kept, error = np.array(_TOLERANCES) * self.voxel_size
+        joined, near, kept, error = np.array(expert().many_poses.tolerances) * self.voxel_size
         self.rules = GroupingRules(joined, near, kept, error, optimizer=optimizer)
         self.unusable: dict[int, str] = {}
         self.shapes: list[Shape] = []
@@ -219,9 +212,9 @@ class Survey:
             for i in scans:
                 if i < j and (i, j) not in self.outcomes:
                     overlap = self.overlaps.of(j, i, predicted_motion(j, i, group.poses))
-                    if overlap > _CLOSING_OVERLAP:
+                    if overlap > expert().many_pairs.closing_overlap:
                         found.append((-overlap, i))
-            chosen |= {(i, j) for _, i in sorted(found)[:_CLOSING_PER_SCAN]}
+            chosen |= {(i, j) for _, i in sorted(found)[: expert().many_pairs.closing_per_scan]}
         return chosen
 
     def map_pairs(self, groups: list[Group], edges: Sequence[Edge]) -> list[MapPair]:
@@ -283,7 +276,7 @@ class Survey:
         source, target = self._ends(pair)
         T = inverse(self.initial.poses[target]) @ self.initial.poses[source]
         local = shift_frames(T, -self.shapes[source].origin, -self.shapes[target].origin)
-        if self.overlaps.of(source, target, local) < _GUESSED_OVERLAP:
+        if self.overlaps.of(source, target, local) < expert().many_pairs.guessed_overlap:
             return None
         return tuple(float(value) for value in T.ravel())
 
@@ -365,11 +358,13 @@ class Survey:
         found = []
         sigma = [np.radians(self.initial.turn_deg)] * 3 + [self.initial.shift] * 3
         information = np.diag(1 / np.square(sigma))
-        information *= _ODOMETRY_POINTS / float(np.trace(information[3:, 3:]))
+        information *= expert().many_pairs.odometry_points / float(np.trace(information[3:, 3:]))
         for i, j in pairwise(self.usable()):
             T = inverse(self.initial.poses[i]) @ self.initial.poses[j]
             local = shift_frames(T, -self.shapes[j].origin, -self.shapes[i].origin)
-            found.append(Edge(j, i, local, _ODOMETRY_CONFIDENCE, information, self.initial.shift))
+            found.append(
+                Edge(j, i, local, expert().many_pairs.odometry_confidence, information, self.initial.shift)
+            )
         return found
 
     def _stand(self, scan: int) -> FloatArray:

@@ -17,6 +17,7 @@ from geomoe3d.config import DecisionConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision import confidence
 from geomoe3d.decision.confidence import (
+    FITTED_PRIOR,
     Information,
     Judgement,
     confidence_score,
@@ -289,6 +290,19 @@ def test_the_threshold_is_the_users(least: float) -> None:
     for score, lead in itertools.product((0.05, 0.2, 0.5, 2.0), (1.5, 5.0)):
         judged = judge(evidence(score), lead, 0.05, FIRM, DecisionConfig(min_confidence=least))
         assert (judged.status == "ok") == (judged.confidence >= least)
+
+
+def test_a_prior_shifts_the_odds_by_what_it_differs_by() -> None:
+    def odds(prior: float | None) -> float:
+        p = confidence_score(evidence(0.2), 2.0, 0.05, FIRM, prior=prior)
+        return p / (1 - p)
+
+    assert odds(None) == pytest.approx(odds(FITTED_PRIOR))
+    assert odds(0.5) / odds(0.2) == pytest.approx(4.0)
+    judged = [
+        judge(evidence(0.2), 2.0, 0.05, FIRM, DecisionConfig(prior=p)).confidence for p in (0.05, 0.5, 0.95)
+    ]
+    assert judged == sorted(judged) and judged[0] < judged[-1]
 
 
 def test_confidence_rises_with_evidence_and_lead_and_stays_in_range() -> None:

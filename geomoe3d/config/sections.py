@@ -196,6 +196,13 @@ class DecisionConfig(Section):
     ambiguity_ratio: float = Field(
         0.8, gt=0, le=1, description="a distinct second hypothesis this good makes the answer ambiguous"
     )
+    prior: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="share of the pairs you ask that do overlap, where you know it: the confidence is for such a mix; "
+        "None: nine in ten do, as in the mix that it was fitted on",
+    )
 
 
 class RegistrationConfig(Section):

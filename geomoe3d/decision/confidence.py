@@ -31,6 +31,7 @@ _COEFFICIENTS = {
     (True, False): (-7.984, np.array([1.953, 1.534, -4.965, 0.444, -2.722, 0.169, 0.0])),
     (False, False): (-1.976, np.array([1.813, 3.895, -5.902, 1.117, -2.994, 1.447, 0.0])),
 }
+FITTED_PRIOR = 0.88  # 300 related pairs, and 160 unrelated ones that count a quarter each
 _LEAST_SCORE, _LEAST_SUPPORT, _LEAST_OVERLAP, _ADDED_OBSERVABILITY = 1e-3, 0.002, 0.01, 1e-3
 _LEAST_LOOSENESS, _MOST_LOOSENESS = 0.02, 10.0
 _LOOSEST = 1000.0
@@ -194,7 +195,7 @@ def judge(
         ``ok``.
     """
     evidence, heard = evidence_of(answer), opinion_of(answer) is not None
-    confidence = confidence_score(evidence, lead, support, information, heard=heard)
+    confidence = confidence_score(evidence, lead, support, information, heard=heard, prior=config.prior)
     notes = []
     if evidence.overlap < _LOW_OVERLAP:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -214,7 +215,7 @@ def judge(
         notes.insert(0, slides)
         return Judgement("ambiguous", tuple(notes), min(confidence, 0.3))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
-    alone = confidence_score(evidence, UNRIVALLED_LEAD, support, information)
+    alone = confidence_score(evidence, UNRIVALLED_LEAD, support, information, prior=config.prior)
     # What the clouds like alike is ambiguous unless the network makes the answer sure: by how much it prefers one
     # hangs on which correspondences it saw.
     alike = (
@@ -314,14 +315,25 @@ def confidence_inputs(
 
 
 def confidence_score(
-    evidence: Evidence, lead: float, support: float, information: Information, *, heard: bool = False
+    evidence: Evidence,
+    lead: float,
+    support: float,
+    information: Information,
+    *,
+    heard: bool = False,
+    prior: float | None = None,
 ) -> float:
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence.
 
-    ``heard``: whether a network was asked about the answer; see `judge` for the other arguments.
+    ``heard``: whether a network was asked about the answer; ``prior``: P(a pair overlaps) before it is looked at, None
+    for that of the mix that the coefficients were fitted on; see `judge` for the other arguments.
+
+    Source of the prior: Bayes' rule, which adds to the logit what the prior's differs by.
     """
     if evidence.surface_score <= 0:
         return 0.0
     offset, slopes = _COEFFICIENTS[heard, information.sensors_known]
     strength = offset + confidence_inputs(evidence, lead, support, information) @ slopes
+    if prior is not None:
+        strength += np.log(prior / (1 - prior)) - np.log(FITTED_PRIOR / (1 - FITTED_PRIOR))
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

@@ -16,7 +16,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import bounded_voxel_size, own_voxel_sizes, round_size
-from geomoe3d.clouds.viewpoint import find_viewpoints, known_viewpoints, sign_breaks
+from geomoe3d.clouds.viewpoint import known_viewpoints, sign_breaks
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
@@ -92,10 +92,9 @@ class Line:
             wanted = round_size(max(sizes))
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         rule = config.preparation.viewpoint
-        views = find_viewpoints(*clouds, rule)
-        prepared = self.pipeline.prepare_both(clouds, voxel_size, views, clock)
         # Known places, not guessed ones: the network was trained on true ones, or none.
         places = known_viewpoints(*clouds, rule)
+        prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock)
         look = self._best(clouds, prepared, places)
         clock("decide")
         decision = look.decision
@@ -245,7 +244,7 @@ class Line:
         if NETWORK in self.pipeline.scorers:
             opinion = opinion_of(decision.answer)
             said = None if opinion is None else opinion.output
-            weighed = said or FilterOutput(np.zeros(len(pair.matched)))
+            weighed = said or decision.agreement(pair.matched, pair.inlier_threshold)
         result = finished_result(pair, decision, self.config, self.clock.stop())
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)

@@ -11,7 +11,13 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
-from geomoe3d.config import DescriptorConfig, RegistrationConfig, ScoringConfig, expert
+from geomoe3d.config import (
+    DescriptorConfig,
+    PreparationConfig,
+    RegistrationConfig,
+    ScoringConfig,
+    expert,
+)
 from geomoe3d.errors import ConfigError, EmptyCloudError
 from geomoe3d.estimators.base import Estimator, estimator
 from geomoe3d.estimators.proposals import propose
@@ -24,6 +30,7 @@ from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, judges_transforms, p
 from geomoe3d.parts import Part, Registry
 from geomoe3d.refinement.base import Refiner, refiner
 from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
+from geomoe3d.runtime.threads import each
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import Scorer, make_scorers, scorer
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, Hypothesis, PointCloud, PreparedCloud
@@ -87,9 +94,8 @@ class Pipeline:
         sides: Sides = "sensor",
     ) -> PreparedCloud:
         """One cloud on the grid, with normals and features, or as the cache holds it."""
-        config, seed, describe = self.config.preparation, self.config.seed, self.descriptor
-        if sides == "centroid":
-            config, viewpoint = config.model_copy(update={"viewpoint": "centroid"}), None
+        config, viewpoint = self._preparation(viewpoint, sides)
+        seed, describe = self.config.seed, self.descriptor
 
         def make() -> PreparedCloud:
             clock("prepare")
@@ -101,6 +107,17 @@ class Pipeline:
             return make()
         return self._cache.fetch(cloud, feature_identity(voxel_size, viewpoint, config, describe, seed), make)
 
+    def _preparation(
+        self, viewpoint: FloatArray | None, sides: Sides
+    ) -> tuple[PreparationConfig, FloatArray | None]:
+        """Settings, and the place of the sensor, with which normals point to the sides that are wanted."""
+        config = self.config.preparation
+        return (
+            (config.model_copy(update={"viewpoint": "centroid"}), None)
+            if sides == "centroid"
+            else (config, viewpoint)
+        )
+
     def prepare_both(
         self,
         clouds: tuple[PointCloud, PointCloud],
@@ -109,11 +126,20 @@ class Pipeline:
         clock: StageClock,
         sides: Sides = "sensor",
     ) -> Clouds:
-        """`prepare` for source and target."""
-        first, second = (
-            self.prepare(cloud, voxel_size, view, clock, sides)
-            for cloud, view in zip(clouds, views, strict=True)
-        )
+        """`prepare` for source and target, side by side where nothing is cached."""
+        both = list(zip(clouds, views, strict=True))
+        if self._cache is not None:
+            first, second = (self.prepare(cloud, voxel_size, view, clock, sides) for cloud, view in both)
+            return first, second
+
+        def on_grid(one: tuple[PointCloud, FloatArray | None]) -> PreparedCloud:
+            config, viewpoint = self._preparation(one[1], sides)
+            return prepare(one[0], voxel_size, config, viewpoint=viewpoint, seed=self.config.seed)
+
+        clock("prepare")
+        made = each(on_grid, both)
+        clock("features")
+        first, second = (with_features(cloud, self.descriptor) for cloud in made)
         return first, second
 
     def match(

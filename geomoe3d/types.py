@@ -220,6 +220,8 @@ class Hypothesis:
         asked: names of the scorers that were really asked about it.
         refined: the same hypothesis after refinement, once it was refined; itself an hypothesis.
         note: what went wrong in the refinement that led to it, or None.
+        settled: whether its estimator saw so many correspondences agree with it, and so many more than with any
+            different transform, that it needs no costly scorer.
     """
 
     T_target_source: FloatArray
@@ -229,6 +231,7 @@ class Hypothesis:
     asked: set[str] = field(default_factory=set)
     refined: Hypothesis | None = None
     note: str | None = None
+    settled: bool = False
 
     def anew(self) -> Hypothesis:
         """The same transform as it was proposed, to be scored by others."""

@@ -164,6 +164,31 @@ def test_a_network_is_shown_a_few_distinct_motions_once(pair):
     assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
 
 
+class Silent(NetworkScorer):
+    """A network that must not be asked."""
+
+    def about(self, pair):
+        """See `Scorer`."""
+        raise RuntimeError("asked")
+
+
+def test_what_correspondences_and_clouds_both_settle_is_shown_to_no_network(pair):
+    right, wrong = off(pair[1], 0.5, 0.01), off(pair[1], 90, 1.0)
+    right.settled = True
+    asked = selection(pair, network=Silent())
+    asked.add([right, wrong])
+    findings = asked.decide()
+    assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
+    assert findings.judgement.status == "ok"
+    assert verdict_of(findings) == NetworkScorer().granted().verdict > 0 > opinion_of(wrong).verdict
+    liked, settled = off(pair[1], 0.5, 0.01), off(pair[1], 90, 1.0)
+    settled.settled = True  # but the clouds like another one
+    asked = selection(pair, network=Silent())
+    asked.add([liked, settled])
+    with pytest.raises(RuntimeError, match="asked"):
+        asked.decide()
+
+
 def test_the_verdict_is_on_the_refined_motion(pair):
     """A start 8 degrees off, which the network doubts; refined it is as good as the truth, which it likes."""
     network, _ = opinions(pair[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomoe3d.geometry.columns import bounds, crossed, extents, finite_rows, largest_of_rows
+from geomoe3d.geometry.columns import bounds, crossed, extents, finite_rows
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -16,7 +16,6 @@ def test_same_as_along_the_axes(count: int, order: str) -> None:
     assert np.array_equal(low, points.min(0))
     assert np.array_equal(high, points.max(0))
     assert np.array_equal(extents(points), np.ptp(points, axis=0))
-    assert np.array_equal(largest_of_rows(points), points.max(1))
     np.testing.assert_allclose(crossed(points, points[::-1]), np.cross(points, points[::-1]), rtol=1e-12)
 
 

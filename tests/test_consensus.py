@@ -37,6 +37,19 @@ def test_consensus_finds_few_noisy_inliers(seed: int) -> None:
     assert found[0].num_inliers >= 0.9 * true.sum()
 
 
+def test_consensus_says_what_is_settled_and_proposes_the_same_with_less(seed: int = 3) -> None:
+    rows, T, true = problem(seed, count=1000, inliers=0.3, noise=0.01)
+    found = ConsensusEstimator()(rows, inlier_threshold=THRESHOLD)
+    assert [hypothesis.settled for hypothesis in found] == [True] + [False] * (len(found) - 1)
+    assert_motion(found[0].T_target_source, T, degrees=0.5, length=0.05)
+    assert found[0].num_inliers >= 0.95 * true.sum()
+    longer = ConsensusEstimator(settled_share=1.0)(rows, inlier_threshold=THRESHOLD)
+    assert not longer[0].settled
+    np.testing.assert_allclose(found[0].T_target_source, longer[0].T_target_source, atol=1e-6)
+    few, *_ = problem(seed, count=1000, inliers=0.02, noise=0.01)
+    assert not any(h.settled for h in ConsensusEstimator()(few, inlier_threshold=THRESHOLD))
+
+
 @pytest.mark.parametrize(
     ("count", "first", "second"),
     [(500, 300, 200), (2000, 400, 300), (2000, 600, 400)],
@@ -59,6 +72,7 @@ def test_consensus_keeps_two_motions_of_a_scene_best_first(count: int, first: in
     assert_motion(found[1].T_target_source, B, degrees=0.5, length=0.05)
     assert found[0].num_inliers == pytest.approx(first, abs=10)
     assert found[1].num_inliers == pytest.approx(second, abs=10)
+    assert not any(hypothesis.settled for hypothesis in found)
     # Weights decide which of the two comes first.
     weights = np.where(np.arange(count) < first, 0.2, 1.0)[mixed]
     found = ConsensusEstimator()(rows, weights, inlier_threshold=THRESHOLD)

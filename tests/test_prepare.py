@@ -23,6 +23,7 @@ from geomoe3d.clouds.prepare import (
     own_voxel_sizes,
     prepare,
     scale_mismatch,
+    sorted_rows,
     typical_spacing,
     voxel_keys,
     voxel_means,
@@ -375,3 +376,10 @@ def test_millimetres_against_metres_are_noticed_from_both_sides() -> None:
         assert "'b.ply'" in sentence
         assert "at most 50" in sentence
     assert scale_mismatch(metres, PointCloud(points + 1e6)) is None
+
+
+@pytest.mark.parametrize("bits", [0, 3, 16, 17, 40, 62])
+def test_rows_sorted_by_sixteen_bits_are_those_of_a_stable_sort(bits: int) -> None:
+    keys = np.random.default_rng(bits).integers(0, 2**bits, 3000)
+    keys = np.concatenate([keys, keys[::2]])
+    np.testing.assert_array_equal(sorted_rows(keys), np.argsort(keys, kind="stable"))

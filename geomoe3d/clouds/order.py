@@ -18,7 +18,7 @@ def in_order(first: PointCloud, second: PointCloud) -> bool:
     """
     if len(first) != len(second):
         return len(first) > len(second)
-    spreads = [float(cloud.points.var(axis=0).sum()) for cloud in (first, second)]
+    spreads = [sum(float(column.var()) for column in cloud.points.T) for cloud in (first, second)]
     if spreads[0] != spreads[1]:
         return spreads[0] < spreads[1]
     return first.file_points.tobytes() <= second.file_points.tobytes()

@@ -12,7 +12,7 @@ import numpy as np
 from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import EmptyCloudError, InputError
-from geomoe3d.geometry.columns import extents, largest_of_rows
+from geomoe3d.geometry.columns import extents
 from geomoe3d.geometry.draws import OFF_ROUND, mixed
 from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.threads import each, usable_threads
@@ -20,7 +20,8 @@ from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _MIN_POINTS = 3
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
-_BITS = 21  # of a 64-bit voxel key, for each axis
+_BITS = 21  # of a 64-bit voxel key, for each axis, at most
+_MOST_FLAGS = 2**26  # bytes spent on counting voxels by a flag each
 
 
 def prepare(
@@ -144,7 +145,7 @@ def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float
         InputError: a voxel so small that the grid's indices overflow.
     """
     for cloud in (source, target):
-        while (occupied := len(np.unique(voxel_keys(cloud.points, voxel_size, OFF_ROUND)))) > max_points:
+        while (occupied := _num_different(voxel_keys(cloud.points, voxel_size, OFF_ROUND))) > max_points:
             # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
             voxel_size *= 1.02 * float(np.sqrt(occupied / max_points))
     return voxel_size
@@ -235,7 +236,10 @@ def typical_spacing(points: FloatArray) -> float:
     from scipy.spatial import cKDTree
 
     # All points of a part keep their density; a thinned cloud would look sparser than it is.
-    away = largest_of_rows(np.abs(points - np.median(points[:: max(1, len(points) // 20_000)], axis=0)))
+    middle = np.median(points[:: max(1, len(points) // 20_000)], axis=0)
+    away = np.abs(points[:, 0] - middle[0])
+    for column, at in zip(points.T[1:], middle[1:], strict=True):
+        np.maximum(away, np.abs(column - at), out=away)
     sample = expert().preparation.spacing_sample
     if len(points) > sample:
         away_limit = np.partition(away, sample)[sample]
@@ -284,9 +288,28 @@ def voxel_keys(points: FloatArray, voxel_size: float, shift: float = 0.0) -> Int
                 f"voxel size {voxel_size:.4g} is too small for a cloud of extent {extent:.4g}: more than "
                 f"{limit} voxels along one axis; use at least {extent / limit:.3g} or remove stray points"
             )
-        keys <<= _BITS
+        keys <<= int(cells.max()).bit_length()  # no more than needed: small keys are sorted in fewer steps
         keys |= cells.astype(np.int64)
     return keys
+
+
+def sorted_rows(keys: IntArray) -> IntArray:
+    """Rows of keys (N,), none negative, in rising order, equal ones in theirs; by 16 bits at a time, which numpy counts
+    in place of comparing: a third of the time."""
+    order = np.argsort(keys.astype(np.uint16), kind="stable")
+    for shift in range(16, int(keys.max()).bit_length(), 16):
+        order = order[np.argsort((keys[order] >> shift).astype(np.uint16), kind="stable")]
+    return order
+
+
+def _num_different(keys: IntArray) -> int:
+    """How many different keys there are."""
+    largest = int(keys.max())
+    if largest >= _MOST_FLAGS:
+        return len(np.unique(keys))
+    seen = np.zeros(largest + 1, dtype=np.bool_)
+    seen[keys] = True
+    return int(np.count_nonzero(seen))
 
 
 def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
@@ -301,7 +324,9 @@ def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
 
     weights, order, starts = _by_voxel(points, voxel_size)
     sums = np.add.reduceat(weights, starts)
-    means: FloatArray = np.add.reduceat(points[order] * weights[:, None], starts, axis=0) / sums[:, None]
+    # One coordinate at a time: numpy adds rows of three a third as fast.
+    columns = [np.add.reduceat(column[order] * weights, starts) / sums for column in points.T]
+    means: FloatArray = np.stack(columns, axis=1)
     kept = sums >= expert().preparation.least_held
     thin = np.flatnonzero(~kept)
     if not kept.any():
@@ -314,7 +339,8 @@ def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
 
 def _by_voxel(points: FloatArray, voxel_size: float) -> tuple[FloatArray, IntArray, IntArray]:
     """Weights in a voxel, see `voxel_means`, and rows of the points, both by voxel, and where each voxel starts."""
-    order = np.argsort(keys := voxel_keys(points, voxel_size, OFF_ROUND), kind="stable")
+    keys = voxel_keys(points, voxel_size, OFF_ROUND)
+    order = sorted_rows(keys)
     keys = keys[order]
     starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
     inside: FloatArray = np.full(len(points), 0.5)

@@ -21,6 +21,7 @@ from geomoe3d.types import (
     Alternative,
     CloudReport,
     Correspondences,
+    FilterOutput,
     FloatArray,
     Hypothesis,
     PointCloud,
@@ -104,6 +105,11 @@ class Decision:
         if self.answer is None:
             return np.full(len(matched), np.inf)
         return residuals(self.T_target_source, matched.source, matched.target)
+
+    def agreement(self, matched: Correspondences, threshold: float) -> FilterOutput:
+        """Weights of the correspondences by their residuals alone, 1/2 at the threshold; zero without a transform."""
+        off = (self.residuals(matched) / threshold) ** 2
+        return FilterOutput(1 / (1 + off), 1 - off)
 
 
 def finished_result(

@@ -73,11 +73,16 @@ def measure_scale(T_target_source: FloatArray, source: PreparedCloud, target: Pr
     fit = _Fit(T_target_source, source, target)
     known = expert().scale
     begun = len(known.reaches) - known.thorough_rounds
+    near = False
     for number, reach in enumerate(known.reaches):
-        growth = fit.step(reach * source.voxel_size, few=number < begun)
+        few = number < begun
+        if few and near:
+            continue
+        growth = fit.step(reach * source.voxel_size, few=few)
         if growth is None:
             return None
-        if number >= begun and abs(growth) < known.settled:
+        near = abs(growth) < known.nearly_settled
+        if not few and abs(growth) < known.settled:
             break
     return Scale(float(1 / fit.scale), fit.deviation())
 

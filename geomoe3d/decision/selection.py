@@ -133,6 +133,13 @@ class Selection:
         if not self.hypotheses:
             return
         by_clouds = sorted(self.hypotheses, key=lambda h: -evidence_of(h).surface_score)
+        granted = self._scorers[name].granted()
+        if granted is not None and self._is_settled(by_clouds):
+            for hypothesis in self.hypotheses:
+                same = not self._differ(by_clouds[0], hypothesis)
+                hypothesis.scores[name] = granted if same else self._scorers[name].unasked([granted])
+            self._rank()
+            return
         shown = distinct(by_clouds, self._source, self._shift, count)
         for _ in range(expert().selection.most_rounds):
             if not self._ask(name, [h for h in shown if name not in h.asked]):
@@ -145,6 +152,13 @@ class Selection:
             if name in self.hypotheses[0].asked:
                 return
             shown = self.hypotheses[:1]
+
+    def _is_settled(self, by_clouds: list[Hypothesis]) -> bool:
+        """Whether correspondences and clouds both like one transform so clearly that nobody else is asked."""
+        first, *others = distinct(by_clouds, self._source, self._shift, 2)
+        scores = [evidence_of(h).surface_score for h in (first, *others)]
+        settled = any(h.settled and not self._differ(first, h) for h in by_clouds)
+        return settled and scores[0] > expert().selection.settled_lead * max(scores[1:], default=0.0)
 
     def _rank(self) -> None:
         """Best first; equal ones keep their order."""

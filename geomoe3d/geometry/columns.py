@@ -25,12 +25,6 @@ def extents(points: FloatArray) -> FloatArray:
     return edges
 
 
-def largest_of_rows(points: FloatArray) -> FloatArray:
-    """(N,) the largest of each row's three entries."""
-    largest: FloatArray = np.maximum(np.maximum(points[:, 0], points[:, 1]), points[:, 2])
-    return largest
-
-
 def finite_rows(points: FloatArray) -> BoolArray:
     """(N,) which rows of points (N, 3) hold finite numbers alone."""
     finite: BoolArray = np.isfinite(points[:, 0])

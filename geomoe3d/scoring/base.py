@@ -49,6 +49,10 @@ class Scorer(Part):
         """
         return Belief(min(said.factor for said in known))
 
+    def granted(self) -> Score | None:
+        """What stands for the word of a selective scorer on a hypothesis that is `settled`; None: it is asked."""
+        return None
+
 
 scorer: Registry[Scorer] = Registry("scorer", "geomoe3d.scoring", lambda: Scorer)
 """Decorator by which a scorer joins, and the choice by name."""

@@ -129,3 +129,7 @@ class NetworkScorer(Scorer):
     def unasked(self, known: Sequence[Score]) -> Opinion:
         """As bad as the worst that it was asked about, or -3."""
         return Opinion(min([expert().network.unseen, *(o.verdict for o in known if isinstance(o, Opinion))]))
+
+    def granted(self) -> Opinion:
+        """What it says of such hypotheses in the median."""
+        return Opinion(expert().network.granted)

@@ -66,7 +66,13 @@ class MapsExpert(Section):
 class PlacesExpert(Section):
     """Windows of a map and the transforms proposed in them (`maps/places.py`)."""
 
-    asked: int = constant(1000, "points", (10, 1_000_000), "of the scan that vote")
+    asked: int = constant(1000, "points", (10, 1_000_000), "of the scan that vote and are matched")
+    most_votes: int = constant(
+        60_000_000,
+        "pairs",
+        (1_000_000, 10**12),
+        "of points of scan and map; in larger maps fewer of the scan's vote",
+    )
     matches: tuple[Annotated[int, Field(ge=3, le=1_000_000)], Annotated[int, Field(ge=3, le=1_000_000)]] = (
         constant(
             (500, 1000),

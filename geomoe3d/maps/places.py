@@ -8,6 +8,7 @@ product of the compared points of both (0.1 s for a map of 100,000 points on the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,7 +72,9 @@ class Query:
         """
         from scipy.spatial import cKDTree
 
-        level, edge, asked = self.level.compared, self.radius / 1.5, self._scan.features
+        level, edge = self.level.compared, self.radius / 1.5
+        pairs = len(self._scan.features) * len(level.features)
+        asked = self._scan.features[:: max(1, math.ceil(pairs / expert().places.most_votes))]
         cells = np.floor(level.points / edge).astype(np.int64)
         cells -= cells.min(0)
         shape = cells.max(0) + 1

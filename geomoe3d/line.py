@@ -16,7 +16,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import bounded_voxel_size, own_voxel_sizes, round_size
-from geomoe3d.clouds.viewpoint import known_viewpoints, sign_breaks
+from geomoe3d.clouds.viewpoint import known_viewpoints, seen_by_none, sign_breaks
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
@@ -94,8 +94,9 @@ class Line:
         rule = config.preparation.viewpoint
         # Known places, not guessed ones: the network was trained on true ones, or none.
         places = known_viewpoints(*clouds, rule)
-        prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock)
-        look = self._best(clouds, prepared, places)
+        sides: Sides = "centroid" if seen_by_none(clouds) else "sensor"
+        prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock, sides)
+        look = self._best(clouds, prepared, places, sides)
         clock("decide")
         decision = look.decision
         if decision.answer is not None:
@@ -115,10 +116,12 @@ class Line:
             decision = decision.with_note(remark)
         return self._finished(look._replace(decision=decision), clouds)
 
-    def _best(self, clouds: tuple[PointCloud, PointCloud], prepared: Clouds, places: Places) -> Look:
+    def _best(
+        self, clouds: tuple[PointCloud, PointCloud], prepared: Clouds, places: Places, first: Sides
+    ) -> Look:
         """The surest look at two clouds, prepared with their sensors at ``places``, believed ones or None."""
-        best = self._look(prepared, places)
-        others = self._other_sides(prepared, places)
+        best = self._look(prepared, places, first)
+        others = iter(()) if first == "centroid" else self._other_sides(prepared, places)
         while best.decision.judgement.status != "ok" and (sides := next(others, None)) is not None:
             if sides == "centroid":
                 size = prepared[0].voxel_size

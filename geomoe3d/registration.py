@@ -17,10 +17,8 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.loading import without_missing
 from geomoe3d.clouds.order import in_order
-from geomoe3d.clouds.prepare import (
-    check_cloud,
-    scale_mismatch,
-)
+from geomoe3d.clouds.prepare import check_cloud, scale_mismatch
+from geomoe3d.clouds.viewpoint import Sensors, with_sensors
 from geomoe3d.config import RegistrationConfig, build_config, expert_in_force
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, check_rows
 from geomoe3d.decision.answer import failed_result
@@ -79,10 +77,11 @@ class Registrar:
         *,
         initial: ArrayLike | None = None,
         correspondences: ArrayLike | None = None,
+        sensors: Sensors = (None, None),
         progress: Progress | None = None,
     ) -> RegistrationResult:
         """The transform that maps source into target; see `geomoe3d.register`."""
-        given: dict[str, Any] = {"initial": initial, "correspondences": correspondences}
+        given: dict[str, Any] = {"initial": initial, "correspondences": correspondences, "sensors": sensors}
         return self.explain(source, target, **given, progress=progress).result
 
     @overload
@@ -138,6 +137,7 @@ class Registrar:
         *,
         initial: ArrayLike | None = None,
         correspondences: ArrayLike | None = None,
+        sensors: Sensors = (None, None),
         progress: Progress | None = None,
     ) -> Explanation:
         """`register` with what led to the answer.
@@ -149,6 +149,7 @@ class Registrar:
             _check_guess_is_wanted(config)
         clock("load")
         loaded = _load(source, "source", seed), _load(target, "target", seed)
+        loaded = with_sensors(loaded, sensors, config.preparation.viewpoint)
         clouds = without_missing(loaded[0]), without_missing(loaded[1])
         for cloud in clouds:
             check_cloud(cloud)
@@ -190,6 +191,7 @@ def register(
     config: RegistrationConfig | None = None,
     initial: ArrayLike | None = None,
     correspondences: ArrayLike | None = None,
+    sensors: Sensors = (None, None),
     progress: Progress | None = None,
     **overrides: Any,
 ) -> RegistrationResult:
@@ -204,6 +206,8 @@ def register(
         initial: (4, 4) a first guess in the files' coordinates, or None; scored like all others, not trusted.
         correspondences: (N, 6) matches of your own, rows [source xyz, target xyz] in the files' coordinates,
             which take the place of ours, or None; the clouds score, refine and decide.
+        sensors: of source and target each (3,) where the sensor stood, in the file's coordinates; ``"none"`` where no
+            one sensor saw the cloud; None leaves it to the evidence.
         progress: called with the name of each stage as it begins.
         overrides: top-level configuration keys such as ``voxel_size=0.05`` or ``seed=1``.
 
@@ -215,14 +219,15 @@ def register(
 
     Raises:
         InputError: a cloud that cannot be read or has too few usable points, a guess that is no rigid
-            transform, or correspondences that are no (N, 6) finite numbers.
-        ConfigError: an unknown or invalid override, or a guess where nothing scores or the scale is estimated.
+            transform, correspondences that are no (N, 6) finite numbers, or a sensor that is no place.
+        ConfigError: an unknown or invalid override, a guess where nothing scores or the scale is estimated, or a sensor
+            where ``preparation.viewpoint`` is not auto.
     """
     if overrides:
         tree = (config or RegistrationConfig()).model_dump()
         config = build_config(RegistrationConfig, {**tree, **overrides}, "register(...)")
-    given: dict[str, Any] = {"initial": initial, "correspondences": correspondences, "progress": progress}
-    return Registrar(config).register(source, target, **given)
+    given: dict[str, Any] = {"initial": initial, "correspondences": correspondences, "sensors": sensors}
+    return Registrar(config).register(source, target, **given, progress=progress)
 
 
 def _check_guess_is_wanted(config: RegistrationConfig) -> None:

@@ -33,6 +33,8 @@ class PointCloud:
         num_non_finite: rows dropped because a coordinate was NaN or infinite, or stands for a missing measurement.
         notes: sentences on what of the file was not taken as it stands.
         sensor: (3,) where the file says that its one sensor stood, file coordinates, or None.
+        sensor_given: True where the user said so: ``sensor`` is then believed wherever it lies, and None means that no
+            one sensor saw the cloud.
     """
 
     points: FloatArray
@@ -43,6 +45,7 @@ class PointCloud:
     num_non_finite: int = 0
     notes: tuple[str, ...] = ()
     sensor: FloatArray | None = None
+    sensor_given: bool = False
 
     def __len__(self) -> int:
         return len(self.points)

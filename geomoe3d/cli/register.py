@@ -42,6 +42,12 @@ class _Outputs:
 @click.option("--weights", metavar="FILE", help="Trained network (.safetensors): scorer or filter, as it is.")
 @click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
+@click.option(
+    "--sensor-source",
+    metavar="X,Y,Z",
+    help="Where SOURCE's sensor stood, file coordinates; none: no one sensor.",
+)
+@click.option("--sensor-target", metavar="X,Y,Z", help="The same of TARGET. [found from the scans]")
 @click.option("--inverse", is_flag=True, help="Give the transform that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
 @click.option(
@@ -88,6 +94,8 @@ def command(
     weights: str | None,
     correspondences: str | None,
     initial: str | None,
+    sensor_source: str | None,
+    sensor_target: str | None,
     inverse: bool,
     as_json: bool,
     output: tuple[str, ...],
@@ -130,7 +138,13 @@ def command(
         guess = None if initial is None else load_transform(initial)
         matches = None if correspondences is None else load_correspondences(correspondences)
         registrar = Registrar(config if weights is None else with_weights(config, weights))
-        told: dict[str, Any] = {"initial": guess, "correspondences": matches, "progress": stage}
+        sensors = _place(sensor_source, "--sensor-source"), _place(sensor_target, "--sensor-target")
+        told: dict[str, Any] = {
+            "initial": guess,
+            "correspondences": matches,
+            "sensors": sensors,
+            "progress": stage,
+        }
         explanation: Explanation | None = None
         if picture is not None or page is not None or report is not None or show:
             explanation = registrar.explain(source, target, **told)
@@ -164,6 +178,19 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
 
         color = False if os.environ.get("NO_COLOR") else None
         click.echo(summary(answer, inverted, unit), color=color)
+
+
+def _place(text: str | None, option: str) -> Any:
+    """``none``, or three numbers."""
+    if text is None or text.strip().lower() == "none":
+        return None if text is None else "none"
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"'{text}' is no place; give X,Y,Z in the file's coordinates, or none", param_hint=option
+        ) from None
+    return x, y, z
 
 
 def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], scale: float | None, force: bool) -> None:

@@ -6,12 +6,20 @@ sign in two scans. Place: prepare. Believing costs nothing; guessing takes about
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from geomoe3d.config import expert
+from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.geometry.columns import bounds
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.types import BoolArray, FloatArray, PointCloud, PreparedCloud
+
+Sensors = tuple[ArrayLike | Literal["none"] | None, ArrayLike | Literal["none"] | None]
+"""Where the sensors of source and target stood, as far as the user says; see `with_sensors`."""
 
 
 def find_viewpoints(
@@ -23,7 +31,8 @@ def find_viewpoints(
     cloud, as it does for depth cameras and single laser scans, and never for georeferenced data, nor where
     the cloud was plainly moved there: its mean, the middle of its box or its lowest corner lies at the
     origin. Where it does not, the place is believed that the file itself gives (the pose of its one scan, or
-    VIEWPOINT), within the same limit. ``origin`` always; ``guess`` and ``centroid`` never. Normals of the two
+    VIEWPOINT), within the same limit. A place that the user gave is believed as it is. ``origin`` always; ``guess``
+    and ``centroid`` never. Normals of the two
     clouds must be turned by the same rule, hence both or none.
     """
     if rule in ("guess", "centroid"):
@@ -42,6 +51,51 @@ def known_viewpoints(
     return None if first is None or second is None else (first, second)
 
 
+def with_sensors(
+    clouds: tuple[PointCloud, PointCloud], sensors: Sensors, rule: str
+) -> tuple[PointCloud, PointCloud]:
+    """Source and target, of whose sensors the user knows something.
+
+    Args:
+        clouds: as loaded.
+        sensors: of each (3,) where it stood, file coordinates; ``none`` where no one sensor saw the cloud, as a merged
+            one, a mesh or a whole object; None leaves it to the evidence.
+        rule: that of the configuration, which must then be ``auto``.
+
+    Raises:
+        InputError: a place that is none.
+        ConfigError: another rule.
+    """
+    if all(sensor is None for sensor in sensors):
+        return clouds
+    if rule != "auto":
+        raise ConfigError(
+            f"a sensor's place is given, but preparation.viewpoint is '{rule}', which decides it too; leave one of the "
+            "two out"
+        )
+    return _with_sensor(clouds[0], sensors[0], "source"), _with_sensor(clouds[1], sensors[1], "target")
+
+
+def _with_sensor(cloud: PointCloud, sensor: ArrayLike | Literal["none"] | None, whose: str) -> PointCloud:
+    if sensor is None:
+        return cloud
+    if isinstance(sensor, str):
+        if sensor != "none":
+            raise InputError(
+                f"the sensor of the {whose} is '{sensor}'; give X,Y,Z in the file's coordinates, or none"
+            )
+        return replace(cloud, sensor=None, sensor_given=True)
+    place = np.asarray(sensor, dtype=np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(f"the sensor of the {whose} must be three finite numbers X,Y,Z, found {sensor!r}")
+    return replace(cloud, sensor=place, sensor_given=True)
+
+
+def seen_by_none(clouds: tuple[PointCloud, PointCloud]) -> bool:
+    """Whether the user says of either cloud that no one sensor saw it: normals are then turned to the centroids."""
+    return any(cloud.sensor_given and cloud.sensor is None for cloud in clouds)
+
+
 def believed_viewpoints(
     correspondences: FloatArray, origins: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray] | None:
@@ -57,6 +111,8 @@ def believed_viewpoints(
 
 def _believed(cloud: PointCloud) -> FloatArray | None:
     """The local place (3,) of a cloud's sensor by the rule ``auto``, or None."""
+    if cloud.sensor_given:
+        return None if cloud.sensor is None else cloud.sensor - cloud.origin
     if _sensor_may_be_at_origin(cloud):
         return -cloud.origin
     if cloud.sensor is None:

@@ -1,0 +1,65 @@
+"""Where the sensors stood, said by the user: believed as it is, checked, and none means none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from geomoe3d.cli.register import command
+from geomoe3d.clouds.viewpoint import find_viewpoints, seen_by_none, with_sensors
+from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.errors import ConfigError, InputError
+from geomoe3d.types import PointCloud
+
+FAR = np.array([500.0, -20.0, 3.0])
+
+
+def clouds() -> tuple[PointCloud, PointCloud]:
+    rng = np.random.default_rng(0)
+    first, second = (PointCloud(rng.uniform(-1, 1, (50, 3)), 100.0 * np.ones(3)) for _ in range(2))
+    return first, second
+
+
+def test_a_place_that_is_given_is_believed_wherever_it_lies() -> None:
+    assert find_viewpoints(*clouds(), "auto") == (None, None)
+    given = with_sensors(clouds(), (FAR, (0, 0, 0)), "auto")
+    source, target = find_viewpoints(*given, "auto")
+    assert np.array_equal(source, FAR - 100) and np.array_equal(target, np.full(3, -100.0))
+    assert not seen_by_none(given)
+
+
+def test_none_is_no_sensor_even_where_one_could_stand_at_the_origin() -> None:
+    rng = np.random.default_rng(1)
+    ahead = PointCloud(rng.uniform([2, -1, -1], [4, 1, 1], (200, 3)))
+    assert find_viewpoints(ahead, ahead, "auto")[0] is not None
+    given = with_sensors((ahead, ahead), (None, "none"), "auto")
+    assert find_viewpoints(*given, "auto") == (None, None) and seen_by_none(given)
+    assert with_sensors((ahead, ahead), (None, None), "guess") == (ahead, ahead)
+
+
+@pytest.mark.parametrize("sensor", ["origin", (1.0, 2.0), (1.0, 2.0, np.nan)])
+def test_what_is_no_place_is_refused(sensor: object) -> None:
+    with pytest.raises(InputError, match="sensor of the target"):
+        with_sensors(clouds(), (None, sensor), "auto")  # type: ignore[arg-type]
+
+
+def test_a_place_and_another_rule_exclude_each_other() -> None:
+    with pytest.raises(ConfigError, match="leave one of the two out"):
+        with_sensors(clouds(), ("none", None), "guess")
+
+
+def test_the_command_line_takes_places(tmp_path: Path) -> None:
+    source, target, _ = make_sample_pair(3)
+    paths = [str(tmp_path / f"{name}.npy") for name in ("source", "target")]
+    for path, cloud in zip(paths, (source, target), strict=True):
+        np.save(path, cloud.file_points + FAR)
+    place = ",".join(map(str, FAR))
+    told = ["--sensor-source", place, "--sensor-target", place]
+    done = CliRunner().invoke(command, [*paths, *told, "--quiet"])
+    assert done.exit_code == 0, done.output
+    for wrong in ("1,2", "here", "1,2,x"):
+        refused = CliRunner().invoke(command, [*paths, "--sensor-source", wrong])
+        assert refused.exit_code == 2 and "X,Y,Z" in refused.output

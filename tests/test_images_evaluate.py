@@ -175,7 +175,7 @@ def test_homographies_of_all_three_kinds(tmp_path):
         cv2.imwrite(str(sequence / f"{k}.ppm"), np.dstack([cv2.warpPerspective(image, H, SIZE)] * 3))
         np.savetxt(sequence / f"H_1_{k}", H)
     cv2.imwrite(str(models / "wallA.png"), image)
-    np.savetxt(models / "wall_model.txt", H)
+    np.savetxt(models / "wall_model.txt", np.linalg.inv(H))  # of the second image into the first
     rng = np.random.default_rng(0)
     first = np.column_stack([rng.uniform(0, 300, (80, 2)), np.ones(80)])
     second = first @ H.T

@@ -222,6 +222,7 @@ def images(
     network = None if weights is None else ImageNetwork(weights)
     outcomes = []
     with progress_bar("scenes") as advance:
+        advance(0, len(folders))
         for number, folder in enumerate(folders, 1):
             outcomes += outcomes_of(
                 Path(folder), network, pairs, homographies, None if images is None else Path(images)

@@ -228,14 +228,18 @@ def hpatches_cases(folder: Path) -> Iterator[tuple[str, Matches, FloatArray, Any
 
 
 def model_cases(folder: Path) -> Iterator[tuple[str, Matches, FloatArray, Any]]:
-    """Pairs with NAME_pts.txt (u0 v0 1 u1 v1 1) and NAME_model.txt (H), without ratio and mutuality of the matches."""
+    """Pairs of danini/magsac: NAME_pts.txt (u0 v0 1 u1 v1 1) and NAME_model.txt, which maps B into A.
+
+    Ratio and mutuality of the matches are not known: all count as distinct.
+    """
     for file in sorted(folder.glob("*_model.txt")):
         name = file.name.removesuffix("_model.txt")
         rows = np.loadtxt(folder / f"{name}_pts.txt")[:, [0, 1, 3, 4]]
         image = next(path for path in images_in(folder) if path.stem == f"{name}A")
         height, width = read_grey(image).shape
         matches = Matches(rows, np.zeros(len(rows)), np.ones(len(rows), dtype=bool))
-        yield name, matches, np.loadtxt(file), (width, height)
+        H = np.asarray(np.linalg.inv(np.loadtxt(file)), dtype=np.float64)
+        yield name, matches, H, (width, height)
 
 
 def outcomes_of(

@@ -17,7 +17,7 @@ from geomoe3d.types import BoolArray, FloatArray
 THRESHOLD = 3.0
 """Default inlier threshold, pixels."""
 
-_LEAST_INLIERS = 15
+_LEAST_INLIERS, _MOST_BETWEEN_HALVES = 15, 3.0
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,20 @@ def find_homography(
         np.linalg.matrix_rank(pixels[inliers, :2] - pixels[inliers, :2].mean(axis=0), tol=10 * threshold) < 2
     ):
         reasons.append("the inliers lie in line or at one place, and fix the homography nowhere else")
-    corners = map_points(
-        H, np.array([[x, y] for x in _range(pixels[usable, 0]) for y in _range(pixels[usable, 1])])
-    )
+    extent = np.array([[x, y] for x in _range(pixels[usable, 0]) for y in _range(pixels[usable, 1])])
+    corners = map_points(H, extent)
     if not np.isfinite(corners).all():
         reasons.append("it sends a part of the first image behind the camera")
+    if not reasons:
+        off, order = 0.0, np.random.default_rng(0).permutation(np.flatnonzero(inliers))
+        for half in (order[::2], order[1::2]):
+            other, _ = weighted_dlt(torch.from_numpy(pixels[half]), torch.ones(len(half)))
+            off = max(
+                off,
+                float(np.nan_to_num(np.abs(map_points(other.numpy(), extent) - corners), nan=np.inf).max()),
+            )
+        if off > _MOST_BETWEEN_HALVES * threshold:
+            reasons.append(f"half of the inliers alone move a corner of what is matched by {off:.0f} pixels")
     return HomographyResult("low_confidence" if reasons else "ok", tuple(reasons), H, inliers, residuals)
 
 

@@ -72,6 +72,7 @@ class Finder:
         level = self.level_for(own, coarsest)
         search = self._begun(cloud, view, level, clock)
         known: list[FloatArray] = []
+        times = max(1.0, count / expert().maps.candidates)
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
@@ -80,7 +81,8 @@ class Finder:
                 if finer is None:
                     break
                 search = self._begun(cloud, view, finer, clock)
-            candidates = search.candidates(more=look != "quick", near=where, given=[*local, *known])
+            asked = [*local, *known]
+            candidates = search.candidates(more=look != "quick", near=where, given=asked, times=times)
             known = [h.T_target_source for _, h in candidates]
             found = [search.look(h, fully=look != "quick") for h in likely(candidates, count)]
             if not found:

@@ -8,6 +8,7 @@ its surface, and nothing of the map may stand where the scan's sensor looked thr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -95,6 +96,7 @@ class Search:
         more: bool = False,
         near: tuple[FloatArray, float] | None = None,
         given: Sequence[FloatArray] = (),
+        times: float = 1.0,
     ) -> list[tuple[float, Hypothesis]]:
         """Distinct motions into the map with their quick scores, best first.
 
@@ -103,17 +105,19 @@ class Search:
             near: (3,) where the scan's sensor, or its middle where none is known, is said to be, local coordinates,
                 and how far off at most.
             given: further motions (4, 4), local coordinates.
+            times: so many times the usual number of windows and motions, where more places are asked for than usual.
         """
         self._clock("places")
         within = None if near is None else (near[0], near[1] + float(np.linalg.norm(self.eye - self.center)))
         known = expert().locating
-        windows = self._query.windows(known.more_windows if more else known.windows, within)
+        most = known.more_windows if more else known.windows
+        windows = self._query.windows(math.ceil(times * most), within)
         self._clock("propose")
         scored = [(self._quick(T), Hypothesis(T)) for T in given]
         # What was known before did not convince, or it would not be asked again.
         plain = max([known.plain, *(1.05 * score for score, _ in scored)]) if more else known.plain
         for number, window in enumerate(windows):
-            if number >= known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
+            if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
                 break
             proposed = self._query.motions(window, known.per_window, more=more)
             if near is not None:
@@ -122,11 +126,14 @@ class Search:
         scored.sort(key=lambda item: -item[0])
         chosen: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in scored:
-            if len(chosen) == known.kept:
+            if len(chosen) >= times * known.kept:
                 break
             if all(self.differ(hypothesis, other) for _, other in chosen):
                 chosen.append((score, hypothesis))
-        polished = [Hypothesis(self._polished(h.T_target_source)) for _, h in chosen[: known.polished]]
+        polished = [
+            Hypothesis(self._polished(h.T_target_source))
+            for _, h in chosen[: math.ceil(times * known.polished)]
+        ]
         both = [*chosen, *((self._quick(h.T_target_source), h) for h in polished)]
         best: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in sorted(both, key=lambda item: -item[0]):

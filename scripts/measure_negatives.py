@@ -115,10 +115,10 @@ def _tell(group: str, lines: list[dict[str, Any]]) -> None:
     surely = [line for line in lines if line["confidence"] >= 0.95]
     accepted = [line for line in lines if line["status"] == "ok"]
     right = sum(line["right"] for line in accepted)
-    low, high = wilson(right / len(accepted), len(accepted)) if accepted else (0.0, 1.0)
+    low, high = wilson(right / len(accepted), len(accepted)) if accepted else (0.0, 100.0)
     click.echo(
         f"{group[:44]:44s} {len(lines):5d} pairs, ok {len(accepted)}, wrong and ok {len(accepted) - right}, precision "
-        f"{100 * right / max(len(accepted), 1):.1f} [{100 * low:.1f}, {100 * high:.1f}] %, confidence >= 0.95: "
+        f"{100 * right / max(len(accepted), 1):.1f} [{low:.1f}, {high:.1f}] %, confidence >= 0.95: "
         f"{len(surely)}, wrong {sum(not line['right'] for line in surely)}"
     )
 

@@ -125,6 +125,9 @@ def test_the_page_is_self_contained_and_lists_every_scan(model):
     for scan in model.scans:
         assert scan.name in page
     assert page.count("data-scan=") == 5
+    loops = [loop for group in model.groups for loop in group.loops]
+    assert page.count("<td>closes</td>") == sum(loop.closes for loop in loops) > 0
+    assert page.count("<td>open</td>") == sum(not loop.closes for loop in loops)
     assert "src=" not in page
     assert "http" not in page.replace("http-equiv", "")
     assert "{{" not in page

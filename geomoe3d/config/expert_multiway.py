@@ -128,6 +128,18 @@ class ManyGroupsExpert(Section):
     most_turns: int = constant(
         3, "rounds", (1, 100), "in which groups are joined and what they hold is told to the edges"
     )
+    most_revisions: int = constant(
+        3,
+        "rounds",
+        (0, 100),
+        "in which a model that contradicts its surest edges is made anew without others",
+    )
+    revised: float = constant(2.0, "log-odds", (0, 1000), "by which it must agree better with all edges")
+    revision_sure: float = constant(4.0, "log-odds", (0, 100), "of such an edge by its confidence: 0.993")
+    revision_far: float = constant(3.0, "tolerances", (1, 100), "between it and the poses: more than a bend")
+    revision_asked: int = constant(
+        4, "sets", (1, 1000), "of edges that are left out, and sure edges of a group that are heard"
+    )
     silent_overlaps: tuple[
         Annotated[float, Field(ge=0, le=1)],
         Annotated[float, Field(ge=0, le=1)],

@@ -21,6 +21,7 @@ from geomoe3d.multiway.doubtful import PairKey
 from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
 from geomoe3d.multiway.grouping import Growth, largest_first, reconsidered
+from geomoe3d.multiway.revision import agreement, doubted
 from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.multiway.settling import settle
 from geomoe3d.multiway.survey import Survey, key_of
@@ -45,11 +46,32 @@ class Assembly:
     def groups(self) -> list[Group]:
         """Groups by all edges so far; a scan that cannot be used is a group of its own.
 
+        Where they contradict sure edges, groups without some of the others are tried, and taken if they agree better
+        with all edges.
+        """
+        self.edges = edges = self._heard()
+        given = edges, self._survey.shapes, self._survey.rules
+        groups, best = self._grown(edges), -np.inf
+        for _ in range(expert().many_groups.most_revisions):
+            tried = doubted(groups, edges, *given[1:])
+            if not tried:
+                break
+            best = max(best, agreement(groups, *given) + expert().many_groups.revised)
+            made = [self._grown(some) for some in tried]
+            told = [agreement(some, *given) for some in made]
+            first = int(np.argmax(told))
+            if told[first] <= best:
+                break
+            groups, edges, best = made[first], tried[first], told[first]
+        return groups
+
+    def _grown(self, edges: list[Edge]) -> list[Group]:
+        """Groups by some edges.
+
         What settling lets go may find its place among scans that are better aligned now, so groups are joined
         and settled again while that joins any.
         """
-        survey, edges = self._survey, self._heard()
-        self.edges = edges
+        survey = self._survey
         told = edges, survey.shapes, survey.rules
         groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
         for turn in range(expert().many_groups.most_turns):

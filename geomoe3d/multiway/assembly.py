@@ -44,19 +44,22 @@ class Assembly:
         self._aligned: dict[tuple[tuple[int, bytes], ...], Poses] = {}
 
     def groups(self) -> list[Group]:
-        """Groups by all edges so far; a scan that cannot be used is a group of its own.
+        """Groups by all edges so far; a scan that cannot be used is a group of its own."""
+        self.edges = self._heard()
+        return self._grown(self.edges)
 
-        Where they contradict sure edges, groups without some of the others are tried, and taken if they agree better
-        with all edges.
+    def revised(self, groups: list[Group]) -> list[Group]:
+        """The last groups, or where they contradict sure edges, others that agree better with all edges.
+
+        Every set of edges that is left out in turn costs as much as making groups once.
         """
-        self.edges = edges = self._heard()
-        given = edges, self._survey.shapes, self._survey.rules
-        groups, best = self._grown(edges), -np.inf
-        for _ in range(expert().many_groups.most_revisions):
+        own, given = expert().many_groups, (self.edges, self._survey.shapes, self._survey.rules)
+        edges, best = self.edges, -np.inf
+        for _ in range(own.most_revisions):
             tried = doubted(groups, edges, *given[1:])
             if not tried:
                 break
-            best = max(best, agreement(groups, *given) + expert().many_groups.revised)
+            best = max(best, agreement(groups, *given) + own.revised)
             made = [self._grown(some) for some in tried]
             told = [agreement(some, *given) for some in made]
             first = int(np.argmax(told))

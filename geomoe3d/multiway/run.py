@@ -187,6 +187,7 @@ def register_scans(
         known, groups = groups, assembly.groups()
         if [group.poses.keys() for group in groups] == [group.poses.keys() for group in known]:
             break
+    groups = assembly.revised(groups)
     clock("write the model")
     model = describe_model(survey, assembly.edges, folder, groups)
     write_model(model, merged_voxel_size, e57=e57)

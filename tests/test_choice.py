@@ -358,14 +358,12 @@ def test_a_user_s_own_matches_are_not_described_again(grids_seen):
 
 
 def test_clouds_too_small_for_a_coarser_grid_are_no_error(grids_seen, monkeypatch):
-    prepare_cloud = Pipeline.prepare
-
-    def small(self, cloud, voxel_size, viewpoint, clock, *rest):
+    def small(cloud, voxel_size, config, **more):
         if voxel_size > VOXEL:
             raise EmptyCloudError("2 points remain")
-        return prepare_cloud(self, cloud, voxel_size, viewpoint, clock, *rest)
+        return prepare(cloud, voxel_size, config, **more)
 
-    monkeypatch.setattr(Pipeline, "prepare", small)
+    monkeypatch.setattr("geomoe3d.pipeline.prepare", small)
     source, target, _ = make_sample_pair(seed=0)
     settings = [f"voxel_size={VOXEL}", *UNSURE, ONE_DESCRIPTOR, "second_look.max_correspondences=0"]
     assert Registrar(load_config(None, settings)).register(source, target).status != "failed"

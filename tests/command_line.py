@@ -61,7 +61,9 @@ class FakeRegistrar:
     def __init__(self, config=None):
         self.config = config
 
-    def register(self, source, target, *, initial=None, correspondences=None, progress=None):
+    def register(
+        self, source, target, *, initial=None, correspondences=None, sensors=(None, None), progress=None
+    ):
         type(self).asked.append((source, target, self.config))
         type(self).initial = initial
         for stage in ("load", "decide"):
@@ -73,7 +75,9 @@ class FakeRegistrar:
             raise self.answer
         return self.answer
 
-    def explain(self, source, target, *, initial=None, correspondences=None, progress=None):
+    def explain(
+        self, source, target, *, initial=None, correspondences=None, sensors=(None, None), progress=None
+    ):
         result = self.register(source, target, initial=initial, progress=progress)
         points = np.random.default_rng(0).normal(size=(50, 3))
         moved = transform_points(TRUTH, points)

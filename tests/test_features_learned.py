@@ -132,13 +132,15 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 def test_numpy_gives_what_torch_gives(pair) -> None:
     torch = pytest.importorskip("torch")
     from geomoe3d.training.descriptor_network import DescriptorNetwork
-    from geomoe3d.training.descriptor_views import View
+    from geomoe3d.training.descriptor_views import Fragment, batch_view
 
     network = DescriptorNetwork().eval()
     network.load_state_dict({k: torch.from_numpy(v) for k, v in load_tensors(WEIGHTS).items()})
     rows = np.arange(0, len(pair[0]), 7)
     with torch.no_grad():
-        expected = network(View.of(pyramid(pair[0]), rows)).numpy()
+        fragment = Fragment.of(pyramid(pair[0]), "cpu", torch.float32)
+        assert fragment is not None
+        expected = network(batch_view([fragment], [torch.from_numpy(rows)])).numpy()
     found = LearnedDescriptor()(pair[0])[rows, :LEARNED]
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     assert expected.shape == (len(rows), LEARNED)

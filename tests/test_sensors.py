@@ -46,6 +46,12 @@ def test_what_is_no_place_is_refused(sensor: object) -> None:
         with_sensors(clouds(), (None, sensor), "auto")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("sensors", [(FAR, None), (None, FAR), (FAR, "none")])
+def test_one_place_alone_is_refused_where_the_other_is_not_known(sensors: tuple) -> None:
+    with pytest.raises(InputError, match="one alone is of no use"):
+        with_sensors(clouds(), sensors, "auto")
+
+
 def test_a_place_and_another_rule_exclude_each_other() -> None:
     with pytest.raises(ConfigError, match="leave one of the two out"):
         with_sensors(clouds(), ("none", None), "guess")

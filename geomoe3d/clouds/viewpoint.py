@@ -63,7 +63,7 @@ def with_sensors(
         rule: that of the configuration, which must then be ``auto``.
 
     Raises:
-        InputError: a place that is none.
+        InputError: a place that is none, or one place where the other scan's is neither given nor found.
         ConfigError: another rule.
     """
     if all(sensor is None for sensor in sensors):
@@ -73,7 +73,15 @@ def with_sensors(
             f"a sensor's place is given, but preparation.viewpoint is '{rule}', which decides it too; leave one of the "
             "two out"
         )
-    return _with_sensor(clouds[0], sensors[0], "source"), _with_sensor(clouds[1], sensors[1], "target")
+    given = _with_sensor(clouds[0], sensors[0], "source"), _with_sensor(clouds[1], sensors[1], "target")
+    for one, other, whose in ((*given, "target"), (*given[::-1], "source")):
+        known = one.sensor_given and one.sensor is not None
+        if known and (_believed(other) is None):
+            raise InputError(
+                f"the place of one sensor is given, but that of the {whose} is not known, and one alone is of no use; "
+                f"give it too, or leave both out"
+            )
+    return given
 
 
 def _with_sensor(cloud: PointCloud, sensor: ArrayLike | Literal["none"] | None, whose: str) -> PointCloud:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 
+from geomoe3d.errors import InputError
 from geomoe3d.parts import Part, Registry
-from geomoe3d.types import Correspondences, PreparedCloud
+from geomoe3d.types import Correspondences, Float32Array, PreparedCloud
 
 
 class Matcher(Part):
@@ -32,6 +33,19 @@ class Matcher(Part):
             seed: decides every random choice.
             with_ratio: whether the attribute ``ratio`` is asked for.
         """
+
+
+def features_of(source: PreparedCloud, target: PreparedCloud) -> tuple[Float32Array, Float32Array]:
+    """The features of both clouds.
+
+    Raises:
+        InputError: a cloud without features.
+    """
+    if source.features is None or target.features is None:
+        raise InputError(
+            "match needs clouds with features; call with_features(cloud, descriptor) on both first"
+        )
+    return source.features, target.features
 
 
 matcher: Registry[Matcher] = Registry("matcher", "geomoe3d.matching", lambda: Matcher)

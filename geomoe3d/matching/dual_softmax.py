@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomoe3d.errors import InputError
-from geomoe3d.matching.base import Matcher, matcher
+from geomoe3d.matching.base import Matcher, features_of, matcher
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import Correspondences, Float32Array, IntArray, PreparedCloud
 
@@ -50,13 +49,10 @@ class DualSoftmaxMatcher(Matcher):
         Raises:
             InputError: a cloud without features.
         """
-        if source.features is None or target.features is None:
-            raise InputError(
-                "match needs clouds with features; call with_features(cloud, descriptor) on both first"
-            )
-        column, log_score = best_by_dual_softmax(source.features, target.features, self.temperature)
+        own, others = features_of(source, target)
+        column, log_score = best_by_dual_softmax(own, others, self.temperature)
         rows = np.sort(np.argsort(-log_score, kind="stable")[:limit])
-        apart = np.linalg.norm(source.features[rows] - target.features[column[rows]], axis=1)
+        apart = np.linalg.norm(own[rows] - others[column[rows]], axis=1)
         found = Correspondences.between(source, target, rows, column[rows])
         return replace(found, feature_distance=apart.astype(np.float32))
 

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geomoe3d.config import MatchingConfig
-from geomoe3d.errors import InputError
 from geomoe3d.geometry.draws import drawn_rows
-from geomoe3d.matching.base import Matcher, matcher
+from geomoe3d.matching.base import Matcher, features_of, matcher
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
 
@@ -81,12 +80,8 @@ def match(
     Raises:
         InputError: a cloud without features.
     """
-    if source.features is None or target.features is None:
-        raise InputError(
-            "match needs clouds with features; call with_features(cloud, descriptor) on both first"
-        )
     index, distance, ratio, mutual = nearest_features(
-        source.features, target.features, config.neighbors, with_ratio or config.name == "ratio"
+        *features_of(source, target), config.neighbors, with_ratio or config.name == "ratio"
     )
     rows = np.repeat(np.arange(len(source)), index.shape[1])
     columns, mutual = index.ravel(), mutual.ravel()

@@ -1,7 +1,6 @@
 """What the descriptor's network is shown: fragments on three grids, and views of many of them in one batch.
 
-`Fragment` holds a whole pyramid as tensors on one device, from which views at ever other points are quick to take;
-`View.of` goes straight from a pyramid to one view.
+`Fragment` holds a whole pyramid as tensors on one device, from which views at ever other points are quick to take.
 """
 
 from __future__ import annotations
@@ -12,8 +11,7 @@ import torch
 from torch import Tensor
 
 from geomoe3d.features.learned import NUM_NEIGHBORS
-from geomoe3d.features.pyramid import FACTORS, Level, nearest, relations
-from geomoe3d.types import IntArray
+from geomoe3d.features.pyramid import FACTORS, Level, nearest
 
 LOOKS = {
     "middle_middle": (1, 1),
@@ -42,22 +40,6 @@ class View:
     rows: dict[str, Tensor]
     lie: dict[str, Tensor]
 
-    @classmethod
-    def of(cls, levels: tuple[Level, ...], queries: IntArray) -> View:
-        """Of a pyramid, with features wanted at these rows of its finest level."""
-        fine, middle, coarse = levels
-        asked = (fine.take(queries), middle, coarse)
-        given = [torch.from_numpy(asked[0].features)]
-        for level in (middle, coarse):
-            both = torch.from_numpy(fine.features[level.rows]), torch.from_numpy(level.features)
-            given.append(torch.cat(both, 1))
-        rows, lie = {}, {}
-        for name, (at, of) in LOOKS.items():
-            _, near = nearest(asked[at], levels[of], NUM_NEIGHBORS)
-            rows[name] = torch.from_numpy(near)
-            lie[name] = torch.from_numpy(relations(asked[at], levels[of], near))
-        return cls(tuple(given), rows, lie)
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -77,8 +59,13 @@ class Fragment:
     rows: dict[str, Tensor]
 
     @classmethod
-    def of(cls, levels: tuple[Level, ...], device: torch.device | str) -> Fragment | None:
-        """Of a pyramid; None where its coarsest level is too small to look around in."""
+    def of(
+        cls, levels: tuple[Level, ...], device: torch.device | str, kept: torch.dtype = torch.half
+    ) -> Fragment | None:
+        """Of a pyramid; None where its coarsest level is too small to look around in.
+
+        ``kept``: in which precision features are held; half saves a third of the memory.
+        """
         if len(levels[-1]) < NUM_NEIGHBORS:
             return None
         grids, own = [], torch.from_numpy(levels[0].features)
@@ -87,7 +74,7 @@ class Fragment:
             if level.edge > 1:
                 given = torch.cat([own[torch.from_numpy(level.rows)], given], 1)
             points, normals = (torch.from_numpy(x).to(device) for x in (level.points, level.normals))
-            grids.append(Grid(points, normals, given.half().to(device), level.edge))
+            grids.append(Grid(points, normals, given.to(device, kept), level.edge))
         fine, middle, coarse = grids
         looked = {
             name: torch.from_numpy(nearest(levels[at], levels[of], NUM_NEIGHBORS)[1]).int().to(device)

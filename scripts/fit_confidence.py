@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.config import load_config
+from geomoe3d.config import expert, load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
-from geomoe3d.decision.confidence import CONFIDENCE_INPUTS, UNRIVALLED_LEAD, Information, confidence_inputs
+from geomoe3d.decision.confidence import CONFIDENCE_INPUTS, confidence_inputs
+from geomoe3d.decision.information import Information
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.evaluation.metrics import is_right, motion_errors
 from geomoe3d.registration import Registrar
@@ -126,7 +127,7 @@ def measure(
 def lead_of(result: RegistrationResult) -> float:
     """The answer's lead, as the judge saw it."""
     if result.alternative is None:
-        return UNRIVALLED_LEAD
+        return expert().confidence.unrivalled_lead
     score = result.alternative.relative_score
     return 1 / score if score > 0 else float("inf")
 

@@ -31,7 +31,7 @@ KINDS = {
     "of mathematics, physics or rounding: three points fix a motion, millimetres in a metre, what avoids 0 / 0": (
         "*:_E24 *:_BITS *:_HALF *:_BINS *:_TINY *:_EPSILON *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_LIFT *:_MILLIMETRES",
         "geometry/*:_DAMPING geometry/*:*TOLERANCE images/epipolar.py:_DAMPING *:_MAX_SKEW *:_FPFH *:_depth *:_GOLDEN",
-        "*:MIN_MATCHES",
+        "*:MIN_MATCHES *:_LOOSEST",
     ),
     "of how an answer is shown, said or looked up": (
         "visual/*:* cli/*:* batch/page.py:* batch/table.py:* evaluation/report_*:* multiway/page.py:*",

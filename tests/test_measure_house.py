@@ -50,12 +50,9 @@ def test_a_constant_is_of_the_first_kind_that_fits_and_else_decides(house):
 
 
 def test_what_decides_an_answer_stands_in_the_configuration(house):
-    """Still to come: the confidence, which is about to be fitted anew."""
     trees = {
         path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(house.PACKAGE.rglob("*.py"))
     }
     found = house.constants_by_kind(trees)
-    left = [place for place in found[house.DECIDES] if not place.startswith("decision/confidence.py")]
-    assert left == []
-    used = {kind for kind, places in found.items() if places}
-    assert used == {house.DECIDES, *house.KINDS}
+    assert found[house.DECIDES] == []
+    assert {kind for kind, places in found.items() if places} == set(house.KINDS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.decision.confidence import deviations_at
+from geomoe3d.decision.information import deviations_at
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.multiway.edges import Edge, Shape, agrees, displacement, expected_error
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig, expert
-from geomoe3d.decision.confidence import Information, Judgement
+from geomoe3d.decision.confidence import Judgement
+from geomoe3d.decision.information import Information
 from geomoe3d.decision.scale import Scale
 from geomoe3d.geometry.se3 import inverse, motions_apart, residuals, shift_frames, transform_points
 from geomoe3d.result import RegistrationResult, Status

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.answer import Decision
-from geomoe3d.decision.confidence import MOST_LEAD, Judgement, judge, lead_over, measure_information
+from geomoe3d.decision.confidence import Judgement, judge, lead_over
+from geomoe3d.decision.information import measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
 from geomoe3d.refinement.base import Refiner
 from geomoe3d.runtime.timing import StageClock
@@ -214,7 +215,7 @@ class Selection:
         for other in distinct(different, self._source, self._shift, expert().selection.most_rivals):
             # A fair race: a rival that could matter is refined too. One that refines to the answer itself was only
             # proposed less well, and is none: how far off it was proposed is an accident.
-            close = lead_over(answer.score, other.score) < MOST_LEAD
+            close = lead_over(answer.score, other.score) < expert().confidence.most_lead
             refined = self._refine(other) if close else other
             if not self._differ(answer, refined):
                 continue

@@ -15,7 +15,7 @@ import numpy as np
 from geomoe3d.batch.store import Outcome
 from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.config import expert
-from geomoe3d.decision.confidence import deviations_at
+from geomoe3d.decision.information import deviations_at
 from geomoe3d.geometry.se3 import cross_matrix, inverse, rotation_angle_deg, shift_frames, transform_points
 from geomoe3d.types import FloatArray
 

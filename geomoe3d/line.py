@@ -24,6 +24,7 @@ from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.causes import Register, differing_units, mirrored_axes
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
+from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
 from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
@@ -100,6 +101,7 @@ class Line:
         clock("decide")
         decision = look.decision
         if decision.answer is not None:
+            decision = self._made_parallel(look.pair, decision)
             scale = measure_scale(decision.T_target_source, *look.pair.clouds)
             decision = decision.with_scale(scale, exchanged=exchanged)
         if decision.judgement.status != "ok":
@@ -251,6 +253,12 @@ class Line:
         result = finished_result(pair, decision, self.config, self.clock.stop())
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
+
+    def _made_parallel(self, pair: Pair, decision: Decision) -> Decision:
+        wanted = self.config.refinement
+        if not wanted.parallel or wanted.name not in ("gicp", "icp"):
+            return decision
+        return decision.moved(made_parallel(decision.T_target_source, *pair.clouds, pair.inlier_threshold))
 
     def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
         return None if self.again is None else differing_units(clouds, self.again, self.clock)

@@ -236,7 +236,7 @@ def test_default_yaml_is_the_defaults_word_for_word():
     path = ROOT / "configs" / "default.yaml"
     assert load_config(path) == RegistrationConfig()
     expected = commented_yaml(RegistrationConfig())
-    assert path.read_text() == expected, "run: geomoe3d config --out configs/default.yaml --force"
+    assert path.read_text() == expected, "run: geomoe3d config --output configs/default.yaml --force"
 
 
 def test_commented_yaml_reads_back_whatever_the_values(tmp_path):

@@ -19,6 +19,7 @@ from geomoe3d.config.expert_confidence import ConfidenceExpert
 from geomoe3d.config.expert_decision import (
     AccuracyExpert,
     CausesExpert,
+    ParallelExpert,
     RemarksExpert,
     ScaleExpert,
     SelectionExpert,
@@ -50,6 +51,7 @@ class ExpertConfig(Section):
     confidence: ConfidenceExpert = ConfidenceExpert()
     shared_surface: SharedSurfaceExpert = SharedSurfaceExpert()
     accuracy: AccuracyExpert = AccuracyExpert()
+    parallel: ParallelExpert = ParallelExpert()
     scale: ScaleExpert = ScaleExpert()
     similarity: SimilarityExpert = SimilarityExpert()
     causes: CausesExpert = CausesExpert()

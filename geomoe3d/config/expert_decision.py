@@ -91,6 +91,34 @@ class AccuracyExpert(Section):
     )
 
 
+class ParallelExpert(Section):
+    """Main directions of two clouds made parallel (`decision/parallel.py`)."""
+
+    most_asked: int = constant(1500, "points", (100, 1_000_000), "of each cloud whose normals are looked at")
+    width_deg: float = constant(
+        6.0, "degrees", (0.5, 20), "of a direction: normals on a grid of noisy points are off by as much"
+    )
+    least_share: float = constant(0.04, "share", (0, 1), "of the normals within twice the width")
+    least_density: float = constant(
+        0.5,
+        "share",
+        (0, 1),
+        "of these within the width: a quarter for what is evenly round, more than this for a plane",
+    )
+    most_directions: int = constant(8, "directions", (1, 50), "of one cloud")
+    num_seeds: int = constant(50, "normals", (1, 10_000), "of which the one with most others near begins")
+    shifts: int = constant(4, "steps", (1, 100), "towards the mean of the normals around")
+    right_deg: float = constant(
+        5.0, "degrees", (0, 45), "off a right angle at which a third direction is added to two"
+    )
+    reach_deg: float = constant(15.0, "degrees", (0, 45), "within which two directions are taken for one")
+    sigma_deg: float = constant(
+        2.0, "degrees", (0.01, 45), "standard deviation of one scan's direction against the other's"
+    )
+    cut: float = constant(3.0, "standard deviations", (0.1, 100), "apart at which a pair counts a quarter")
+    rounds: int = constant(4, "rounds", (1, 100), "of weighing anew")
+
+
 class ScaleExpert(Section):
     """Whether two clouds are of one size (`decision/scale.py`)."""
 

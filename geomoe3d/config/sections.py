@@ -187,6 +187,11 @@ class RefinementConfig(PartConfig):
     )
     max_distance: float = Field(1.5, gt=0, description="largest distance of matched points, in voxels")
     max_iterations: int = Field(30, ge=1, description="most steps of the refinement")
+    parallel: bool = Field(
+        True,
+        description="in the end the answer is turned so that walls and floors of both scans are parallel, as far as "
+        "the surfaces that they share leave that open; with gicp and icp",
+    )
 
 
 class DecisionConfig(Section):

@@ -51,7 +51,7 @@ def measure_accuracy(
     places = np.vstack([transform_points(T_target_source, source.points), target.points])
     center = contact.points.mean(0)
     farthest = places[np.argmax(np.sum((places - center) ** 2, axis=1))]
-    radius, covariance = _covariance(contact, center, source.voxel_size)
+    radius, covariance = covariance_of(contact, center, source.voxel_size)
     J = np.hstack([-cross_matrix((farthest - center) / radius), np.eye(3)])
     variances = np.trace(covariance[3:, 3:]), np.trace(J @ covariance @ J.T), np.trace(covariance[:3, :3])
     at_center, at_farthest, turned = np.sqrt(variances)
@@ -69,7 +69,7 @@ def measure_accuracy(
     )
 
 
-def _covariance(contact: Contact, center: FloatArray, voxel_size: float) -> tuple[float, FloatArray]:
+def covariance_of(contact: Contact, center: FloatArray, voxel_size: float) -> tuple[float, FloatArray]:
     """Root mean square radius of what is shared, and the covariance (6, 6) of [rotation x radius, translation]."""
     known = expert().accuracy
     per_residual = np.repeat([known.residual_turn, known.residual_shift], 3)

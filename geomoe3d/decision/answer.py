@@ -76,6 +76,12 @@ class Decision:
         both = (h for h in (self.answer, self.alternative) if h is not None)
         return [h.anew() for h in both]
 
+    def moved(self, T_target_source: FloatArray) -> Decision:
+        """The same decision with the answer's transform (4, 4) drawn closer; what was said of it stays."""
+        if self.answer is None:
+            return self
+        return replace(self, answer=replace(self.answer, T_target_source=T_target_source))
+
     def with_note(self, note: str, *, first: bool = False) -> Decision:
         """The same decision with one more sentence among the reasons, at their end or before them."""
         reasons = self.judgement.reasons

@@ -269,11 +269,12 @@ class Line:
 
     def _in_map(self, clouds: tuple[PointCloud, PointCloud], guess: FloatArray | None) -> Explanation:
         """The first cloud sought in the second, much larger one."""
-        from geomoe3d.maps.map import NOWHERE, search_larger
+        from geomoe3d.maps.map import nowhere, search_larger
 
         found = search_larger(*clouds, self.pipeline, guess, self.clock)
         if found is None or found.decision.answer is None:
-            return Explanation(failed_result(clouds, NOWHERE, self.config, self.clock.stop()), *clouds)
+            reason = nowhere(*(cloud.name for cloud in clouds))
+            return Explanation(failed_result(clouds, reason, self.config, self.clock.stop()), *clouds)
         decision = found.decision
         if decision.judgement.status != "ok" and (units := self._units(clouds)) is not None:
             decision = decision.with_note(units, first=True)

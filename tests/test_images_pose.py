@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import click
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,7 @@ from click.testing import CliRunner
 from image_scenes import CAMERA, matches_of, texture
 
 from geomoe3d.cli.main import geomoe3d
-from geomoe3d.errors import CheckpointError, InputError, MissingFileError
+from geomoe3d.errors import CheckpointError, GeoMoE3DError, InputError, MissingFileError
 from geomoe3d.geometry.homography import weighted_dlt
 from geomoe3d.images.cameras import Camera, rotation_deg
 from geomoe3d.images.features import detect, match
@@ -86,6 +87,10 @@ def test_unrelated_images_are_never_ok_and_few_matches_fail():
         ({"weights": np.ones(3)}, "weights"),
         ({"threshold": 0.0}, "threshold"),
         ({"estimator": "magic"}, "magic"),
+        ({"threshold": "wide"}, "wide"),
+        ({"weights": ["heavy"] * 50}, "weights"),
+        ({"seed": 2**31}, "2147483647"),
+        ({"seed": 1.5}, "whole number"),
     ],
 )
 def test_bad_arguments_are_named(changes, words):
@@ -94,6 +99,31 @@ def test_bad_arguments_are_named(changes, words):
         find_pose(pixels, (CAMERA, CAMERA), **changes)
     with pytest.raises(InputError, match=words):
         find_homography(pixels, **changes)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        ([["a", "b", "c", "d"]] * 20, "real numbers"),
+        (None, "NoneType"),
+        (np.zeros((20, 4), complex), "complex"),
+        ([[1, 2, 3, 4], [5, 6]], "real numbers"),
+        (np.full((20, 4), 1e300), "1e[+]300"),
+        (np.zeros(4), r"\(4,\)"),
+    ],
+)
+def test_what_are_no_matches_is_refused(pixels, words):
+    with pytest.raises(InputError, match=words):
+        find_pose(pixels, (CAMERA, CAMERA))
+    for estimator in ("magsac", "dlt"):
+        with pytest.raises(InputError, match=words):
+            find_homography(pixels, estimator=estimator)
+
+
+@pytest.mark.parametrize("cameras", [CAMERA, (CAMERA,), (CAMERA,) * 3])
+def test_a_pose_needs_two_cameras(cameras):
+    with pytest.raises(InputError, match="two cameras"):
+        find_pose(matches_of(50)[0], cameras)
 
 
 def test_distortion_is_undone():
@@ -202,3 +232,45 @@ def test_intrinsics_that_are_none_are_named(pair):
     done = run("pose", pair / "a.png", pair / "b.png", "--intrinsics", "700,700")
     assert isinstance(done.exception, InputError)
     assert "fx,fy,cx,cy" in str(done.exception)
+
+
+def test_images_are_never_written_over_and_outputs_are_refused_before_the_work(pair, tmp_path):
+    images = [tmp_path / "a.png", tmp_path / "b.png"]
+    for image in images:
+        image.write_bytes((pair / image.name).read_bytes())
+    before = [image.read_bytes() for image in images]
+    for verb in ("pose", "homography"):
+        for words, said in (
+            (["--picture", images[0], "--force"], "also an input"),
+            (["--picture", images[1], "--force"], "also an input"),
+            (["--output", tmp_path / "h.txt"], ".json"),
+            (["--picture", tmp_path / "m.foo"], ".svg"),
+            (["--output", tmp_path / "none" / "h.json"], "does not exist"),
+        ):
+            done = run(verb, *images, *words)
+            assert isinstance(done.exception, GeoMoE3DError), (verb, words)
+            assert said in str(done.exception)
+            assert "status" not in done.output  # refused before the answer, not after
+    assert [image.read_bytes() for image in images] == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
+
+
+def test_a_copy_of_an_image_and_one_without_keypoints_are_said(pair, tmp_path):
+    (tmp_path / "copy.png").write_bytes((pair / "a.png").read_bytes())
+    done = run("homography", pair / "a.png", tmp_path / "copy.png")
+    assert "both images are the same file" in done.output
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "flat.png"), np.full((50, 60), 7, np.uint8))
+    done = run("homography", pair / "a.png", tmp_path / "flat.png")
+    assert done.return_value == 3
+    assert "no keypoints were found in" in done.output + done.stderr
+    done = run("pose", pair / "a.png", tmp_path)
+    assert isinstance(done.exception, InputError)
+    assert "is a folder" in str(done.exception)
+
+
+def test_intrinsics_of_the_second_image_alone_are_refused(pair):
+    done = run("pose", pair / "a.png", pair / "b.png", "--intrinsics1", "700,700,240,180")
+    assert isinstance(done.exception, click.UsageError)
+    assert "--intrinsics for IMAGE0" in str(done.exception)

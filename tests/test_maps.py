@@ -144,10 +144,14 @@ def test_bad_input_is_refused_with_what_to_do(house, scan, tmp_path):
         Map.empty().locate(scan[0])
     with pytest.raises(MissingFileError, match="geomoe3d index"):
         Map.open(tmp_path / "none.map")
-    broken = tmp_path / "broken.map"
-    broken.write_bytes(b"nothing of the kind")
-    with pytest.raises(FormatError, match="no map of geomoe3d"):
-        Map.open(broken)
+    whole = tmp_path / "whole.map"
+    house.save(whole)
+    for number, content in enumerate((b"nothing of the kind", b"", whole.read_bytes()[:5000])):
+        broken = tmp_path / f"broken{number}.map"
+        broken.write_bytes(content)
+        with pytest.raises(FormatError, match="no map of geomoe3d, or it is damaged or cut short") as error:
+            Map.open(broken)
+        assert "pickle" not in str(error.value)  # nobody is told to load it unsafely
 
 
 def test_a_changed_file_is_damaged(tmp_path):
@@ -301,6 +305,41 @@ def test_what_is_no_map_is_never_overwritten(tmp_path, monkeypatch, capfd):
     np.testing.assert_array_equal(np.load("two.npy"), cloud)
     assert ask("locate", "house.map", "one.npy") == BAD_INPUT
     assert "'house.map' is a map" in capfd.readouterr().err
+    (tmp_path / "mine.map").write_text("roads and rivers")
+    for more in ((), ("--fresh",)):
+        assert ask("index", "one.npy", "mine.map", *more) == BAD_INPUT
+        assert "no map of geomoe3d" in capfd.readouterr().err
+    assert (tmp_path / "mine.map").read_text() == "roads and rivers"
+
+
+def test_poses_are_never_written_over_a_map_or_a_scan(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    Map.empty().with_cloud(np.random.default_rng(1).uniform(0, 1, (500, 3))).save("house.map")
+    np.save("scan.npy", np.random.default_rng(0).uniform(0, 1, (500, 3)))
+    np.savetxt("guess.txt", np.eye(4))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    locate = ("locate", "scan.npy", "house.map", "--initial", "guess.txt", "--force", "--output")
+    for output, said in (
+        ("house.map", ".tum"),
+        ("scan.npy", ".tum"),
+        ("poses.json", ".tum"),
+        ("guess.txt", "also an input"),
+    ):
+        assert ask(*locate, output) == BAD_INPUT
+        assert said in capfd.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_cloud_too_thin_for_the_grid_is_named_and_where_nothing_is_found_both_are(scan):
+    thin = np.array([[0.0, 0, 0], [1, 0, 0], [0, 50, 0]])
+    with pytest.raises(EmptyCloudError, match=r"'thin': \d of 3 points remain|'thin': \d points remain"):
+        geomoe3d.register(geomoe3d.load_points(thin, name="thin"), scan[0])
+    line = np.outer(np.linspace(-5, 5, 5000), [1.0, 2.0, 3.0])
+    world = Map.empty().with_cloud(geomoe3d.load_points(line, name="line"))
+    found = world.locate(geomoe3d.load_points(scan[0][::20], name="room"))
+    assert found.status == "failed"
+    assert found.result.reasons == ("no place was found in 'line' at which 'room' could lie",)
+    assert np.isnan(found.T_map_scan).all()
 
 
 def test_an_empty_folder_is_named(tmp_path, monkeypatch, capfd):

@@ -49,12 +49,16 @@ def command(
         stage("start")
         from geomoe3d.clouds.io import load_points
         from geomoe3d.clouds.viewpoint import find_viewpoints
+        from geomoe3d.errors import OutputError
         from geomoe3d.maps.map import Map
+        from geomoe3d.maps.store import looks_like_map
         from geomoe3d.multiway.initial import read_poses
         from geomoe3d.multiway.scans import find_clouds
         from geomoe3d.runtime.files import check_output
 
         out = check_output(inputs[-1], force=True)
+        if out.exists() and fresh and not looks_like_map(out):
+            raise OutputError(f"'{out}' exists and is no map of geomoe3d; remove it, or give another name")
         scans = find_clouds(inputs[:-1])
         where = None if poses is None else read_poses(poses, [scan.name for scan in scans])
         made = Map.open(out, config=config) if out.exists() and not fresh else Map.empty(config=config)
@@ -77,5 +81,7 @@ def command(
     if not quiet:
         added = len(made.sources) - len(before)
         sizes = ", ".join(f"{size:.4g}" for size in made.voxel_sizes)
-        what = f"{made.num_points:,} points of {len(made.sources)} clouds ({added} new)"
-        click.echo(f"{out}: {what}, described on a grid of {sizes}")
+        clouds = f"{len(made.sources)} cloud{'s' if len(made.sources) != 1 else ''}"
+        click.echo(
+            f"{out}: {made.num_points:,} points of {clouds} ({added} new), indexed on a grid of {sizes}"
+        )

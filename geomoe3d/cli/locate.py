@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from geomoe3d.cli.errors import BAD_INPUT, HELP, NOT_SURE, OK, traceback_option
-from geomoe3d.cli.files import part_option
+from geomoe3d.cli.files import check_outputs, part_option
 from geomoe3d.cli.parts import configuration_options
 
 if TYPE_CHECKING:
@@ -77,11 +77,10 @@ def command(
         from geomoe3d.errors import InputError
         from geomoe3d.maps.map import Map
         from geomoe3d.multiway.scans import find_clouds
-        from geomoe3d.runtime.files import check_output
 
-        if output is not None:
-            check_output(output, force=force)
         scans = find_clouds(inputs[:-1])
+        read = [*(scan.path for scan in scans), inputs[-1], *filter(None, [initial])]
+        check_outputs([("--output", output, (".tum", ".txt"))], [str(path) for path in read], force)
         if initial is not None and len(scans) > 1:
             raise click.UsageError(f"--initial is a guess of one scan, found {len(scans)}")
         guess = None if initial is None else load_transform(initial)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.files import check_outputs
 
 if TYPE_CHECKING:
     from geomoe3d.images.cameras import Camera
@@ -18,27 +20,31 @@ if TYPE_CHECKING:
     from geomoe3d.types import BoolArray, FloatArray
 
 
-def _shared(estimators: tuple[str, ...]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def _shared(
+    estimators: tuple[str, ...], threshold: str
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         for option in reversed(
             (
                 click.argument("image0", type=click.Path()),
                 click.argument("image1", type=click.Path()),
                 click.option("--detector", default="rootsift", show_default=True,
-                             type=click.Choice(("rootsift", "sift", "orb"))),
-                click.option("--keypoints", default=2000, show_default=True, type=click.IntRange(min=8),
-                             help="Most per image."),
+                             type=click.Choice(("rootsift", "sift", "orb")), help="What finds keypoints."),
+                click.option("--keypoints", metavar="N", default=2000, show_default=True,
+                             type=click.IntRange(8, 100_000), help="Most per image."),
                 click.option("--matches", type=click.Choice(("distinct", "loose", "mutual", "all")),
                              help="Which nearest neighbours go to the estimator: mutual ones that pass the ratio test "
                              "at 0.8 or, loosely, at 0.95, all mutual ones, or all. [distinct; loose with --weights]"),
-                click.option("--weights", type=click.Path(), help="Network that rejects wrong matches "
-                             "(.safetensors, see configs/train/images)."),
-                click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators)),
-                click.option("--threshold", type=click.FloatRange(min=0, min_open=True),
-                             help="Inlier threshold, pixels."),
-                click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0)),
-                click.option("--output", type=click.Path(), help="Write the answer as JSON."),
-                click.option("--picture", type=click.Path(), help="Draw the matches (.png, .jpg, .pdf, .svg)."),
+                click.option("--weights", metavar="FILE",
+                             help="Network that rejects wrong matches (.safetensors, see configs/train/images)."),
+                click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators),
+                             help="What fits the matches that are right and rejects the others."),
+                click.option("--threshold", metavar="PIXELS", type=click.FloatRange(min=0, min_open=True),
+                             help=f"Inlier threshold. [{threshold}]"),
+                click.option("--seed", metavar="N", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1),
+                             help="Random seed: the same seed, the same answers."),
+                click.option("--output", metavar="FILE.json", help="Write the answer as JSON."),
+                click.option("--picture", metavar="FILE", help="Draw the matches: .png, .jpg, .pdf or .svg."),
                 click.option("--force", is_flag=True, help="Replace files that exist."),
             )
         ):  # fmt: skip
@@ -49,7 +55,7 @@ def _shared(estimators: tuple[str, ...]) -> Callable[[Callable[..., Any]], Calla
 
 
 @click.command(context_settings=HELP)
-@_shared(("magsac", "ransac", "eight_point"))
+@_shared(("magsac", "ransac", "eight_point"), "1/800 of the image's longer side")
 @click.option("--intrinsics", metavar="FX,FY,CX,CY",
               help="Of both cameras, pixels; four distortions k1,k2,p1,p2 may follow; or a folder of photographs "
               "with cameras that holds both. [guessed: the answer is never 'ok']")  # fmt: skip
@@ -65,6 +71,8 @@ def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str 
 
     from geomoe3d.images.pose import find_pose
 
+    if intrinsics is None and intrinsics1 is not None:
+        raise click.UsageError("--intrinsics1 is of IMAGE1 alone; give --intrinsics for IMAGE0 too")
     matches, sizes = _matches(given)
     paths = (Path(given["image0"]), Path(given["image1"]))
     first = _camera(intrinsics, paths[0], sizes[0])
@@ -88,7 +96,7 @@ def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str 
 
 
 @click.command(context_settings=HELP)
-@_shared(("magsac", "ransac", "dlt"))
+@_shared(("magsac", "ransac", "dlt"), "3")
 @traceback_option
 @click.pass_context
 def homography(context: click.Context, /, **given: Any) -> None:
@@ -116,14 +124,16 @@ def homography(context: click.Context, /, **given: Any) -> None:
 
 def _matches(given: dict[str, Any]) -> tuple[Matches, list[tuple[int, int]]]:
     from geomoe3d.images.features import detect, match
-    from geomoe3d.runtime.files import check_output
+    from geomoe3d.images.picture import SUFFIXES
 
-    for name in ("output", "picture"):
-        if given[name] is not None:
-            check_output(given[name], force=given["force"])
-    keypoints = [detect(given[name], given["detector"], given["keypoints"]) for name in ("image0", "image1")]
-    found = match(*keypoints)
-    return found, [one.size for one in keypoints]
+    names = [given["image0"], given["image1"]]
+    wanted = (("--output", given["output"], (".json",)), ("--picture", given["picture"], SUFFIXES))
+    check_outputs(wanted, [*names, *filter(None, [given["weights"]])], given["force"])
+    keypoints = [detect(name, given["detector"], given["keypoints"]) for name in names]
+    for name, one in zip(names, keypoints, strict=True):
+        if len(one.pixels) == 0:
+            click.echo(f"warning: no keypoints were found in '{name}'", err=True)
+    return match(*keypoints), [one.size for one in keypoints]
 
 
 def _weights(given: dict[str, Any], matches: Matches, rays: FloatArray) -> tuple[FloatArray, Verdict | None]:
@@ -176,6 +186,8 @@ def _tell(
     from geomoe3d.images.picture import save_matches
     from geomoe3d.runtime.files import write_text
 
+    if filecmp.cmp(given["image0"], given["image1"], shallow=False):
+        reasons.append("both images are the same file")
     click.echo(f"status: {status}")
     for reason in reasons:
         click.echo(f"  {reason}")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
-from geomoe3d.cli.files import part_option
+from geomoe3d.cli.files import check_outputs, part_option
 from geomoe3d.cli.parts import configuration_options, scale_option
 
 if TYPE_CHECKING:
@@ -120,7 +119,8 @@ def command(
     """
 
     outputs = _Outputs(output, aligned, aligned_precision, distances, picture, page, report, unit)
-    _check_outputs(outputs, (source, target), None if config.scale == "estimate" else 1.0, force)
+    read = [source, target, *filter(None, (correspondences, initial, weights))]
+    _check_outputs(outputs, read, None if config.scale == "estimate" else 1.0, force)
     if show:
         from geomoe3d.visual.window import check_display
 
@@ -193,15 +193,13 @@ def _place(text: str | None, option: str) -> Any:
     return x, y, z
 
 
-def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], scale: float | None, force: bool) -> None:
+def _check_outputs(outputs: _Outputs, inputs: Sequence[str], scale: float | None, force: bool) -> None:
     """Every output path is refused before the work begins, if it has to be refused at all.
 
     ``scale``: of the transform, None where it will be estimated.
     """
     from geomoe3d.clouds.io import check_aligned
-    from geomoe3d.clouds.transform_files import check_scale_format, check_suffix, transform_format
-    from geomoe3d.errors import OutputError
-    from geomoe3d.runtime.files import check_output
+    from geomoe3d.clouds.transform_files import check_scale_format, transform_format
     from geomoe3d.visual.picture import FORMATS
 
     wanted = (
@@ -213,22 +211,13 @@ def _check_outputs(outputs: _Outputs, inputs: tuple[str, str], scale: float | No
     )
     for name in outputs.transforms:
         check_scale_format(*transform_format(name), scale)
-    taken = {Path(path).resolve(): "an input" for path in inputs}
-    for option, path, suffixes in wanted:
-        if path is None:
-            continue
-        if suffixes:
-            check_suffix(path, suffixes)
-        check_output(path, force=force)
-        owner = taken.get(Path(path).resolve())
-        if owner is not None:
-            raise OutputError(f"{option} '{path}' is also {owner}; give another name")
-        taken[Path(path).resolve()] = option
+    check_outputs(wanted, inputs, force)
     if outputs.aligned is not None:
         settings: dict[str, Any] = {"precision": outputs.precision, "distances": outputs.distances}
         check_aligned(outputs.aligned, inputs[0], **settings, force=force)
-    elif outputs.distances:
-        raise click.UsageError("--distances writes into the file of --aligned; give --aligned FILE too")
+    elif outputs.distances or outputs.precision != "auto":
+        option = "--distances" if outputs.distances else "--aligned-precision"
+        raise click.UsageError(f"{option} is of the file of --aligned; give --aligned FILE too")
 
 
 def _write(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,10 @@ NUM_KEYPOINTS = 2000
 LONGER_SIDE = 800
 RATIO, LOOSE_RATIO = 0.8, 0.95
 """Ratio test by itself, and behind a network that rejects wrong matches."""
+MOST_SEED = 2**31 - 1
+"""OpenCV holds its seed in 32 bits."""
+_MOST_PIXEL = 1e7
+"""Farther out no image reaches; squares of what is much larger no longer fit a number."""
 _CONTRAST = 1e-5
 """So low that images without much contrast give as many keypoints as are asked for."""
 
@@ -67,8 +72,10 @@ def read_grey(path: str | Path) -> NDArray[np.uint8]:
         InputError: OpenCV cannot read it.
     """
     cv2 = opencv()
+    if Path(path).is_dir():
+        raise InputError(f"'{path}' is a folder; give one image of it")
     if not Path(path).is_file():
-        raise MissingFileError(f"no image '{path}'")
+        raise MissingFileError(f"there is no image '{path}'; check the path")
     image: NDArray[np.uint8] | None = cv2.imread(
         str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     )
@@ -132,18 +139,36 @@ def match(first: Keypoints, second: Keypoints) -> Matches:
     return Matches(np.hstack([first.pixels, second.pixels[nearest]]), ratio, mutual)
 
 
-def checked(
-    pixels: FloatArray, weights: FloatArray | None, threshold: float | None
-) -> tuple[FloatArray, FloatArray]:
+def checked(pixels: object, weights: object, threshold: Any, seed: Any = 0) -> tuple[FloatArray, FloatArray]:
     """Matches (N, 4) and their weights (N,), 0 for rows that are not finite and 1 where none are given.
 
     Raises:
-        InputError: shapes do not fit, or a threshold that is not positive.
+        InputError: shapes do not fit, values that are no real numbers or no pixels, a threshold that is not positive,
+            or a seed that OpenCV cannot take.
     """
-    points = np.asarray(pixels, dtype=np.float64)
-    w = np.ones(len(points)) if weights is None else np.nan_to_num(np.asarray(weights, dtype=np.float64))
-    if points.ndim != 2 or points.shape[1] != 4 or w.shape != (len(points),):
-        raise InputError(f"matches must be (N, 4) and weights (N,), found {points.shape} and {w.shape}")
-    if threshold is not None and not (np.isfinite(threshold) and threshold > 0):
-        raise InputError(f"the inlier threshold must be positive, found {threshold} pixels")
-    return points, np.where(np.isfinite(points).all(axis=1), w, 0.0)
+    points = _numbers("matches", pixels)
+    shape = points.shape
+    w = np.ones(shape[:1]) if weights is None else np.nan_to_num(_numbers("weights", weights))
+    if len(shape) != 2 or shape[1] != 4 or w.shape != shape[:1]:
+        raise InputError(f"matches must be (N, 4) and weights (N,), found {shape} and {w.shape}")
+    usable = np.isfinite(points).all(axis=1)
+    most = float(np.abs(points[usable]).max(initial=0.0))
+    if most > _MOST_PIXEL:
+        raise InputError(f"matches must be in pixels, found {most:g}; at most {_MOST_PIXEL:g} is allowed")
+    if threshold is not None and not (isinstance(threshold, Real) and 0 < float(threshold) < np.inf):
+        raise InputError(f"the inlier threshold must be a positive number of pixels, found {threshold}")
+    if not (isinstance(seed, Integral) and 0 <= int(seed) <= MOST_SEED):
+        raise InputError(f"the seed must be a whole number from 0 to {MOST_SEED}, found {seed}")
+    return points, np.where(usable, w, 0.0)
+
+
+def _numbers(name: str, values: object) -> FloatArray:
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiub":
+        raise InputError(
+            f"{name} must be an array of real numbers, found {type(values).__name__} ({array.dtype})"
+        )
+    return array.astype(np.float64)

@@ -52,7 +52,7 @@ def find_homography(
     Raises:
         InputError: shapes do not fit, a threshold that is not positive, or an unknown estimator.
     """
-    pixels, w = checked(pixels, weights, threshold)
+    pixels, w = checked(pixels, weights, threshold, seed)
     usable = np.isfinite(pixels).all(axis=1)
     kept = np.flatnonzero(w > 0)
     nothing = HomographyResult("failed", (), None, np.zeros(len(pixels), bool), np.full(len(pixels), np.inf))

@@ -12,6 +12,7 @@ from geomoe3d.errors import FormatError
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 _MOST = 400
 
 
@@ -45,7 +46,7 @@ def save_matches(
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    if Path(path).suffix.lower() not in (".png", ".jpg", ".jpeg", ".pdf", ".svg"):
+    if Path(path).suffix.lower() not in SUFFIXES:
         raise FormatError(
             f"cannot write a picture as '{Path(path).suffix}' ('{path}'); use .png, .jpg, .pdf or .svg"
         )

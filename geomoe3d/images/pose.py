@@ -9,7 +9,7 @@ matches give the same pose.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -96,7 +96,9 @@ def find_pose(
     Raises:
         InputError: shapes do not fit, a threshold that is not positive, or an unknown estimator.
     """
-    pixels, w = checked(pixels, weights, threshold)
+    pixels, w = checked(pixels, weights, threshold, seed)
+    if not (isinstance(cameras, Sequence) and len(cameras) == 2):
+        raise InputError("two cameras are needed, (of the first image, of the second image)")
     usable = np.isfinite(pixels).all(axis=1)
     focal = (cameras[0].focal + cameras[1].focal) / 2
     if threshold is None:

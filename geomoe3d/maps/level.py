@@ -69,13 +69,14 @@ class Level:
     twin_features: Float32Array
 
     @classmethod
-    def of(cls, voxels: VoxelSums, voxel_size: float, config: PreparationConfig) -> Level:
+    def of(cls, voxels: VoxelSums, voxel_size: float, config: PreparationConfig, name: str = "map") -> Level:
         """Describe a map on one grid.
 
         Args:
             voxels: on a grid as fine or finer.
             voxel_size: wanted edge.
             config: neighbourhoods of the normals, in voxels.
+            name: of the map, for messages.
 
         Raises:
             EmptyCloudError: fewer than 3 points with neighbours remain.
@@ -86,8 +87,8 @@ class Level:
         points = drop_isolated(points, radius)
         if len(points) < (least := expert().maps.least_points):
             raise EmptyCloudError(
-                f"{len(points)} points of the map remain on a {voxel_size:.4g} grid, at least {least} are needed; "
-                "give a denser map or a voxel size that fits it"
+                f"'{name}': {len(points)} points remain on a {voxel_size:.4g} grid, at least {least} are needed; "
+                "give a denser cloud or a voxel size that fits it"
             )
         normals = estimate_normals(points, radius, config.normal_neighbors)
         normals, known = _turned(points, normals, voxels)

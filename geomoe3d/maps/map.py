@@ -36,7 +36,6 @@ from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, PointCloud
 
 _PIECE = 1_000_000
-NOWHERE = "no place in the map was found at which the scan could lie"
 
 
 class Map:
@@ -247,7 +246,7 @@ class Map:
         local = None if asked is None else (asked[0] - self._voxels.origin, asked[1])
         best, ranked = self._finder(cloud, scan, guesses, local, max(k, expert().maps.candidates), clock)
         if best is None or best.decision.answer is None:
-            return self._nowhere(cloud, NOWHERE, clock)
+            return self._nowhere(cloud, nowhere(cloud.name, self.name), clock)
         result = finished_result(best.pair, best.decision, self.config, clock.stop())
         origins, top = (cloud.origin, self._voxels.origin), best.decision.answer.score
         places = tuple(
@@ -283,7 +282,7 @@ class Map:
 
     def _described(self, size: float) -> Level:
         """A new level."""
-        made = Level.of(self._voxels, max(size, self._voxels.edge), self.config.preparation)
+        made = Level.of(self._voxels, max(size, self._voxels.edge), self.config.preparation, self.name)
         self._levels = tuple(sorted((*self._levels, made), key=_size))
         return made
 
@@ -305,6 +304,11 @@ class Map:
     def _nowhere(self, cloud: PointCloud, reason: str, clock: StageClock) -> Location:
         target = PointCloud(self._voxels.points, self._voxels.origin, name=self.name)
         return Location(failed_result((cloud, target), reason, self.config, clock.stop()), ())
+
+
+def nowhere(scan: str, world: str) -> str:
+    """The reason of an answer without any candidate."""
+    return f"no place was found in '{world}' at which '{scan}' could lie"
 
 
 def _size(level: Level) -> float:
@@ -334,7 +338,9 @@ def _near(near: ArrayLike | None, within: float | None, k: int) -> tuple[FloatAr
     if k < 1:
         raise InputError(f"k is {k}, expected at least 1 place")
     if (near is None) != (within is None):
-        raise InputError("near and within belong together: a place (x, y, z) and how far off it may be")
+        raise InputError(
+            "near and within (--near, --within) belong together: a place X,Y,Z and how far off it may be"
+        )
     if near is None or within is None:
         return None
     place = np.asarray(near, dtype=np.float64)

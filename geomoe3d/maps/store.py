@@ -102,14 +102,23 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, t
                     f"'{path}' is damaged: its content does not match its hash; index the map again"
                 )
             return sources, voxels, levels
+    except FormatError:
+        raise
     except FileNotFoundError:
         raise MissingFileError(f"there is no map '{path}'; make one: geomoe3d index CLOUD {path}") from None
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
         raise FormatError(
-            f"'{path}' is no map of geomoe3d or damaged ({error}); make one: geomoe3d index CLOUD OUT.map"
+            f"'{path}' is no map of geomoe3d, or it is damaged or cut short; make one: geomoe3d index CLOUD OUT.map"
         ) from None
     except OSError as error:
         raise cannot_read(error, f"cannot read the map '{path}': {error.strerror or error}") from None
+
+
+def looks_like_map(path: Path) -> bool:
+    """Whether a file begins as a map does; also one that is damaged or cut short further on."""
+    with path.open("rb") as handle:
+        start = handle.read(64)
+    return start.startswith(b"PK") and b"told.npy" in start
 
 
 def _descriptor() -> str:

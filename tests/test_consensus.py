@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist
 
 from geomoe3d.estimators import consensus
 from geomoe3d.estimators.consensus import ConsensusEstimator
+from geomoe3d.geometry.rigid_fit import products
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
 
 # ---- recovery ---------------------------------------------------------------------------------------
@@ -184,13 +185,14 @@ def test_seeds_are_the_best_supported_and_spread() -> None:
     points[:10] = points[0] + 0.01 * rng.normal(size=(10, 3))  # one bundle with the largest supports
     support = np.r_[np.linspace(50, 41, 10), np.linspace(40, 26, 40)].astype(np.float32)
     ranks = rng.permutation(50).astype(np.uint64)
-    seeds = consensus.choose_seeds(support, cdist(points, points).astype(np.float32), ranks, 30)
+    strength = consensus.strengths(support, cdist(points, points).astype(np.float32))
+    seeds = consensus.choose_seeds(strength, ranks, 30)
     # 0 leads; all others of the bundle count half, less than any of the scattered ones. Three quarters of
     # the seeds are the strongest in that order, the others those of the rest that have the lowest ranks.
     order = [0, *range(10, 50), *range(1, 10)]
     assert list(seeds[:23]) == order[:23]
     assert list(seeds[23:]) == sorted(order[23:], key=lambda k: ranks[k])[:7]
-    assert list(consensus.choose_seeds(support, cdist(points, points), ranks, 50)) == list(range(50))
+    assert list(consensus.choose_seeds(strength, ranks, 50)) == list(range(50))
 
 
 def test_score_is_the_documented_sum() -> None:
@@ -203,16 +205,16 @@ def test_score_is_the_documented_sum() -> None:
         (vote * np.exp(-((transform_points(x, source) - target) ** 2).sum(1) / (2 * 0.75**2))).sum()
         for x in T
     ]
-    np.testing.assert_allclose(consensus.score(R, t, source, target, vote), expected, rtol=1e-4)
+    np.testing.assert_allclose(consensus.score(R, t, products(source, target), vote), expected, rtol=1e-4)
 
 
 def test_refit_leaves_a_motion_with_two_inliers() -> None:
     source = np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5]], dtype=np.float32)
     target = source + np.array([[0.1, 0, 0], [0.1, 0, 0], [30, 0, 0], [0, 30, 0]])
     R, t = np.eye(3, dtype=np.float32)[None], np.zeros((1, 3), dtype=np.float32)
-    R_new, t_new = consensus.refit(R, t, source, target.astype(np.float32), np.ones(4, dtype=np.float32))
+    R_new, t_new = consensus.refit(R, t, products(source, target), np.ones(4, dtype=np.float32))
     np.testing.assert_array_equal(R_new, R)
     np.testing.assert_array_equal(t_new, t)
     target[2] = source[2] + [0.1, 0, 0]
-    _, t_new = consensus.refit(R, t, source, target.astype(np.float32), np.ones(4, dtype=np.float32))
+    _, t_new = consensus.refit(R, t, products(source, target), np.ones(4, dtype=np.float32))
     np.testing.assert_allclose(t_new, [[0.1, 0, 0]], atol=1e-5)

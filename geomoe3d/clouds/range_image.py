@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomoe3d.types import BoolArray, FloatArray, IntArray
+from geomoe3d.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,12 @@ class RangeImage:
     Attributes:
         viewpoint: (3,) sensor position.
         axes: (3, 3) rows forward, left, up; up is a direction in which the cloud has no points if it can.
-        nearest: (rows, columns) smallest range in the 3 x 3 pixels around, infinite where nothing was seen.
-        seen: (rows, columns) True where the pixel itself holds a point.
+        nearest: (rows, columns) smallest range in the 3 x 3 pixels around, -inf where the pixel itself holds no point.
     """
 
     viewpoint: FloatArray
     axes: FloatArray
     nearest: FloatArray
-    seen: BoolArray
 
     @classmethod
     def of(cls, points: FloatArray, viewpoint: FloatArray, pixel_deg: float = 2.5) -> RangeImage:
@@ -36,23 +34,19 @@ class RangeImage:
         columns = round(360 / pixel_deg)
         shape = (columns // 2, columns)
         axes = _viewing_axes(points - viewpoint)
-        row, column, distance = _pixels(points, viewpoint, axes, shape)
+        pixel, distance = _pixels(points, viewpoint, axes, shape)
         nearest = np.full(shape, np.inf)
-        np.minimum.at(nearest, (row, column), distance)
-        seen = np.isfinite(nearest)
+        np.minimum.at(nearest.reshape(-1), pixel, distance)
         around = np.minimum(nearest, np.minimum(np.roll(nearest, 1, 1), np.roll(nearest, -1, 1)))
         padded = np.pad(around, ((1, 1), (0, 0)), constant_values=np.inf)
         around = np.minimum(around, np.minimum(padded[:-2], padded[2:]))
-        return cls(viewpoint, axes, around, seen)
+        return cls(viewpoint, axes, np.where(np.isfinite(nearest), around, -np.inf))
 
-    def margins(self, points: FloatArray) -> tuple[BoolArray, FloatArray]:
-        """For points (N, 3) that are claimed to exist: whether the sensor saw something in their direction,
-        and how far they lie behind it (negative: in space which it saw through; infinite where not seen)."""
-        row, column, distance = _pixels(points, self.viewpoint, self.axes, self.seen.shape)
-        seen = self.seen[row, column]
-        behind = np.full(len(points), np.inf)
-        behind[seen] = distance[seen] - self.nearest[row[seen], column[seen]]
-        return seen, behind
+    def margins(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """For points (N, 3) that are claimed to exist: how far they lie behind what the sensor saw in their direction
+        (negative: in space which it saw through; inf where it saw nothing), and their distances from the sensor."""
+        pixel, distance = _pixels(points, self.viewpoint, self.axes, self.nearest.shape)
+        return distance - self.nearest.take(pixel), distance
 
 
 def _viewing_axes(rays: FloatArray) -> FloatArray:
@@ -69,11 +63,13 @@ def _viewing_axes(rays: FloatArray) -> FloatArray:
 
 def _pixels(
     points: FloatArray, viewpoint: FloatArray, axes: FloatArray, shape: tuple[int, ...]
-) -> tuple[IntArray, IntArray, FloatArray]:
-    rays = (points - viewpoint) @ axes.T
-    distance = np.sqrt(np.einsum("ij,ij->i", rays, rays))
-    azimuth = np.arctan2(rays[:, 1], rays[:, 0]) / (2 * np.pi) + 0.5
-    polar = np.arccos(np.clip(rays[:, 2] / np.maximum(distance, 1e-12), -1, 1)) / np.pi
+) -> tuple[IntArray, FloatArray]:
+    """In which pixel, counted row by row, points (N, 3) lie, and how far away."""
+    # One coordinate at a time: on columns of rows of three numpy's functions take two to three times as long.
+    x, y, z = axes @ (points - viewpoint).T
+    distance = np.sqrt(x * x + y * y + z * z)
+    azimuth = np.arctan2(y, x) * (0.5 / np.pi) + 0.5
+    polar = np.arccos(np.clip(z / np.maximum(distance, 1e-12), -1, 1)) / np.pi
     row = np.minimum((polar * shape[0]).astype(np.int64), shape[0] - 1)
     column = np.minimum((azimuth * shape[1]).astype(np.int64), shape[1] - 1)
-    return row, column, distance
+    return row * shape[1] + column, distance

@@ -62,11 +62,9 @@ def measure_information(
 
     Returns NaN matrices, observability 0 and looseness 1000 for fewer than 6 matched points.
     """
-    from scipy.spatial import cKDTree
-
     known = source.viewpoint is not None and target.viewpoint is not None
     moved = transform_points(T_target_source, source.points)
-    distance, nearest = cKDTree(target.points).query(moved, distance_upper_bound=threshold)
+    distance, nearest = target.tree.query(moved, distance_upper_bound=threshold)
     distance, nearest = np.asarray(distance), np.asarray(nearest)
     hit = np.isfinite(distance)
     if hit.sum() < 6:

@@ -30,16 +30,23 @@ from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.draws import Ranks, cell_ranks
-from geomoe3d.geometry.rigid_fit import Floats, fit_rigid, fit_rigid_shared, spread_shared, squared_residuals
+from geomoe3d.geometry.rigid_fit import (
+    fit_rigid,
+    fit_rigid_shared,
+    products,
+    spread_shared,
+    squared_residuals_shared,
+)
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.runtime.threads import each, single_blas_thread
-from geomoe3d.types import Float32Array, FloatArray, Hypothesis, IntArray
+from geomoe3d.types import BoolArray, Float32Array, FloatArray, Hypothesis, IntArray
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 _BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
-_SCORED_AT_ONCE = 500_000
+_PAIRED = 125  # the same where several such blocks are worked on
+_SCORED_AT_ONCE = 64_000
 
 
 @estimator("consensus")
@@ -116,14 +123,16 @@ class ConsensusEstimator(Estimator):
             return []
         centre = rows.mean(0)
         # One unit of length is the inlier threshold from here on, so float32 keeps enough digits.
-        unit = ((rows - centre) / inlier_threshold).astype(np.float32)
-        source, target = np.ascontiguousarray(unit[:, :3]), np.ascontiguousarray(unit[:, 3:])
+        unit = (rows - centre) / inlier_threshold
+        known = products(unit[:, :3], unit[:, 3:])
         # Multiples of 1/1024 add up exactly in float32, in whatever order. Weighed by planes they do not:
         # fixed blocks and one BLAS thread keep the answers the same for any number of threads.
         vote = (np.ceil(given / given.max() * bundle_weights(rows[:, 3:]) * 1024) / 1024).astype(np.float32)
         ranks = cell_ranks(rows, inlier_threshold, seed)
         dense = self._dense_rows(given, ranks)
-        R, t, scores, settled = self._propose(source, target, vote, ranks, dense, surroundings)
+        R, t, scores, settled = self._propose(
+            unit.astype(np.float32), known, vote, ranks, dense, surroundings
+        )
         # Refits bring some together, and some are not firm: half as many again are carried to the end.
         some = self.num_hypotheses + self.num_hypotheses // 2
         most = some if settled else max(self.num_refined, some)
@@ -131,18 +140,17 @@ class ConsensusEstimator(Estimator):
             keep = self._distinct_rows(R, t, scores, limit)
             R, t = R[keep], t[keep]
             for _ in range(refits):
-                R, t = refit(R, t, source, target, vote)
-            scores = score(R, t, source, target, vote, surroundings)
+                R, t = refit(R, t, known, vote)
+            scores = score(R, t, known, vote, surroundings)
             if surroundings is not None:
-                factor = surroundings.plausibility(R, _shift(R, t, centre / inlier_threshold))
-                scores = scores * factor.astype(np.float32)
+                scores = scores * surroundings.plausibility(R, _shift(R, t, centre / inlier_threshold))
         best = self._distinct_rows(R, t, scores, some)
-        finished = _finished(R[best], t[best], scores[best], rows, centre, vote, inlier_threshold)
+        finished = _finished(R[best], t[best], scores[best], unit, known, centre, vote, inlier_threshold)
         if finished and self._is_settled(R[best], t[best], scores[best], len(rows)):
             finished[0].settled = finished[0].proposal_score == float(scores[best[0]])
         return finished[: self.num_hypotheses]
 
-    def _is_settled(self, R: Floats, t: Floats, scores: Floats, count: int) -> bool:
+    def _is_settled(self, R: FloatArray, t: FloatArray, scores: FloatArray, count: int) -> bool:
         """Whether one of the motions (K, 3, 3), (K, 3) has all that it takes; see `settled_share`."""
         first, *others = self._distinct_rows(R, t, scores, 2)
         rival = max((float(scores[k]) for k in others), default=0.0)
@@ -156,34 +164,35 @@ class ConsensusEstimator(Estimator):
 
     def _propose(
         self,
-        source: Float32Array,
-        target: Float32Array,
+        unit: Float32Array,
+        known: FloatArray,
         vote: Float32Array,
         ranks: Ranks,
         rows: IntArray,
         surroundings: Surroundings | None,
-    ) -> tuple[Floats, Floats, Float32Array, bool]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
         """One motion per seed and size of its local set: R (K, 3, 3), t (K, 3), their scores (K,), and whether the
         first seeds settled it."""
-        p, q, v = source[rows], target[rows], vote[rows]
+        p, q = (np.ascontiguousarray(side[rows]) for side in np.hsplit(unit, 2))
+        v = vote[rows]
         near = None if surroundings is None else surroundings.take(rows)
         source_distance, compatible = compatibility(p, q, self.length_tolerance, near)
-        support = compatible @ v
-        seeds = choose_seeds(support, source_distance, ranks[rows], self.num_seeds)
-        witnesses = np.sort(choose_seeds(support, source_distance, ranks[rows], self.num_witnesses))
+        strength = strengths(compatible @ v, source_distance)
+        seeds = choose_seeds(strength, ranks[rows], self.num_seeds)
+        witnesses = np.sort(choose_seeds(strength, ranks[rows], self.num_witnesses))
 
-        def of(some: IntArray) -> tuple[Floats, Floats, Float32Array]:
+        def of(some: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             members, weights = local_sets(compatible, some, v, max(self.set_sizes), witnesses)
             sets = [(members[:, : size + 1], weights[:, : size + 1]) for size in self.set_sizes]
             fits = [fit_rigid(p[rows], q[rows], weight) for rows, weight in sets]
-            R, t = (np.concatenate(part) for part in zip(*fits, strict=True))
-            return R, t, score(R, t, source, target, vote, surroundings)
+            R, t = (np.concatenate(part).astype(np.float64) for part in zip(*fits, strict=True))
+            return R, t, score(R, t, known, vote, surroundings)
 
         # The first block holds strong seeds and drawn ones: these propose what a second, weaker motion has.
         half = _BLOCK // 2
         first, *others = _blocks(np.concatenate([seeds[:half], seeds[half:][::-1]]))
         proposed = [of(first)]
-        settled = self._seems_settled(*proposed[0], source, target, vote, surroundings)
+        settled = self._seems_settled(*proposed[0], known, vote, surroundings)
         if not settled:
             proposed += each(of, others)
         R, t, scores = (np.concatenate(part) for part in zip(*proposed, strict=True))
@@ -191,11 +200,10 @@ class ConsensusEstimator(Estimator):
 
     def _seems_settled(
         self,
-        R: Floats,
-        t: Floats,
-        scores: Floats,
-        source: Float32Array,
-        target: Float32Array,
+        R: FloatArray,
+        t: FloatArray,
+        scores: FloatArray,
+        known: FloatArray,
         vote: Float32Array,
         surroundings: Surroundings | None,
     ) -> bool:
@@ -205,61 +213,65 @@ class ConsensusEstimator(Estimator):
         best = self._distinct_rows(R, t, scores, self.num_tried)
         R, t = R[best], t[best]
         for _ in range(self.num_refits):
-            R, t = refit(R, t, source, target, vote)
-        return self._is_settled(R, t, score(R, t, source, target, vote, surroundings), len(vote))
+            R, t = refit(R, t, known, vote)
+        return self._is_settled(R, t, score(R, t, known, vote, surroundings), len(vote))
 
-    def _distinct_rows(self, R: Floats, t: Floats, scores: Floats, limit: int) -> list[int]:
+    def _distinct_rows(self, R: FloatArray, t: FloatArray, scores: FloatArray, limit: int) -> list[int]:
         """Greedy choice by score; each pick takes all motions close to it out of the race."""
         least_trace = 1 + 2 * np.cos(np.radians(self.distinct_angle_deg))
-        order = np.argsort(-scores, kind="stable")
-        turns, places = R[order].reshape(-1, 9), t[order]
-        left = np.ones(len(order), dtype=np.bool_)
-        keep: list[int] = []
-        pick = 0
-        while len(keep) < limit and left[pick:].any():
-            pick += int(left[pick:].argmax())
-            keep.append(int(order[pick]))
+        turns, squares = R.reshape(-1, 9), np.einsum("ki,ki->k", t, t)
+
+        def close(some: IntArray, others: IntArray | list[int]) -> BoolArray:
             # The centroid is at zero in these coordinates, so t is where it goes.
-            away = places - places[pick]
-            near = np.einsum("ki,ki->k", away, away) < self.distinct_thresholds**2
-            left &= ~(near & (turns @ turns[pick] > least_trace))
-            left[pick] = False
+            away = squares[some, None] + squares[others] - 2 * (t[some] @ t[others].T)
+            found: BoolArray = away < self.distinct_thresholds**2
+            found &= turns[some] @ turns[others].T > least_trace
+            return found
+
+        keep: list[int] = []
+        for some in _blocks(np.argsort(-scores, kind="stable"), _PAIRED):
+            free = some[~close(some, keep).any(1)]
+            among, left = close(free, free), np.ones(len(free), dtype=np.bool_)
+            for row in range(len(free)):
+                if left[row]:
+                    keep.append(int(free[row]))
+                    left &= ~among[row]
+                    if len(keep) == limit:
+                        return keep
         return keep
 
 
 def _finished(
-    R: Floats,
-    t: Floats,
-    scores: Float32Array,
-    rows: FloatArray,
+    R: FloatArray,
+    t: FloatArray,
+    scores: FloatArray,
+    unit: FloatArray,
+    known: FloatArray,
     centre: FloatArray,
     vote: Float32Array,
     inlier_threshold: float,
 ) -> list[Hypothesis]:
-    """A last fit in float64 on the inliers of each motion, in order; those without enough are left out.
+    """A last fit on the inliers of each motion, in order; those without enough are left out.
 
-    R (K, 3, 3), t (K, 3) in inlier thresholds about ``centre``; rows (N, 6) as they came.
+    R (K, 3, 3), t (K, 3), unit (N, 6) in inlier thresholds about ``centre``; known (N, 17) the products of unit.
     """
-    source, target = (rows - centre)[:, :3], (rows - centre)[:, 3:]
-    R64: Floats = R.astype(np.float64)
-    t64: Floats = t.astype(np.float64) * inlier_threshold
-    r2 = squared_residuals(R64, t64, source, target) / inlier_threshold**2
+    r2 = squared_residuals_shared(R, t, known)
     weights = vote * (r2 < 1) / (1 + r2)
     # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
-    thinnest = np.minimum(spread_shared(source, weights), spread_shared(target, weights))
-    firm = ((weights > 0).sum(1) >= 3) & (thinnest >= 0.05 * inlier_threshold)
+    thinnest = np.minimum(spread_shared(unit[:, :3], weights), spread_shared(unit[:, 3:], weights))
+    firm = ((weights > 0).sum(1) >= 3) & (thinnest >= 0.05)
     if not firm.any():
         return []
-    R64, t64 = fit_rigid_shared(source, target, weights[firm])
-    r2 = squared_residuals(R64, t64, source, target) / inlier_threshold**2
-    shift = _shift(R64, t64, centre)
+    R, t = fit_rigid_shared(known, weights[firm])
+    counts = (squared_residuals_shared(R, t, known) < 1).sum(1)
+    shift = _shift(R, t * inlier_threshold, centre)
     return [
         Hypothesis(make_transform(*motion), float(score_value), int(count))
-        for *motion, score_value, count in zip(R64, shift, scores[firm], (r2 < 1).sum(1), strict=True)
+        for *motion, score_value, count in zip(R, shift, scores[firm], counts, strict=True)
     ]
 
 
-def _shift(R: Floats, t: Floats, centre: FloatArray) -> FloatArray:
+def _shift(R: FloatArray, t: FloatArray, centre: FloatArray) -> FloatArray:
     """t (K, 3) of motions about ``centre`` (6,), the means of both halves, as they are about the origin."""
     found: FloatArray = t + centre[3:] - np.einsum("kij,j->ki", R, centre[:3])
     return found
@@ -297,35 +309,43 @@ def compatibility(
     apart = np.empty((len(source), len(source)), dtype=np.float32)
     compatible = np.empty_like(apart)
 
-    def fill(some: IntArray) -> None:
-        block = slice(some[0], some[-1] + 1)
-        apart[block] = distances(source[block], source)
-        gap = distances(target[block], target)
-        gap -= apart[block]
-        np.less(np.abs(gap, out=gap), tolerance, out=compatible[block], casting="unsafe")
-        if surroundings is not None:
-            compatible[block] *= surroundings.pairs(source, target, apart[block], block)
+    agree = None if surroundings is None else surroundings.of_pairs(source, target)
 
-    each(fill, _blocks(np.arange(len(source))))
+    def fill(some: IntArray) -> None:
+        # Both are symmetric: from the diagonal on, and the same below it.
+        rows, rest = slice(some[0], some[-1] + 1), slice(some[0], None)
+        near = distances(source[rows], source[rest])
+        gap = distances(target[rows], target[rest])
+        gap -= near
+        found = np.less(np.abs(gap, out=gap), tolerance, out=gap, casting="unsafe")
+        if agree is not None:
+            found *= agree(rows, near)
+        for whole, part in ((apart, near), (compatible, found)):
+            whole[rows, rest] = part
+            whole[rest, rows] = part.T
+
+    each(fill, _blocks(np.arange(len(source)), _PAIRED))
     np.fill_diagonal(compatible, 0)
     return apart, compatible
 
 
-def _blocks(rows: IntArray) -> list[IntArray]:
-    """Rows in parts of at most `_BLOCK`, the same ones for any number of threads."""
-    return [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
+def _blocks(rows: IntArray, size: int = _BLOCK) -> list[IntArray]:
+    """Rows in parts of at most ``size``, the same ones for any number of threads."""
+    return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
-def choose_seeds(support: Float32Array, source_distance: Float32Array, ranks: Ranks, limit: int) -> IntArray:
-    """Rows with the largest support, and a quarter of the limit drawn from all others, those of the lowest ranks.
-
-    One beaten by a neighbour within the threshold counts half, so that a dense bundle of wrong matches does
-    not take all places; the drawn quarter gives a second, weaker motion its proposals.
-    """
-    if len(support) <= limit:
-        return np.arange(len(support))
+def strengths(support: Float32Array, source_distance: Float32Array) -> Float32Array:
+    """Support (N,), half of it where a neighbour within the threshold has more, so that a dense bundle of wrong matches
+    does not take all places."""
     beaten = ((source_distance < 1.0) & (support[None, :] > support[:, None])).any(1)
-    strength = np.where(beaten, 0.5 * support, support)
+    return np.where(beaten, np.float32(0.5) * support, support)
+
+
+def choose_seeds(strength: Float32Array, ranks: Ranks, limit: int) -> IntArray:
+    """Rows with the largest strength, and a quarter of the limit drawn from all others, those of the lowest ranks: they
+    give a second, weaker motion its proposals."""
+    if len(strength) <= limit:
+        return np.arange(len(strength))
     order = np.argsort(-strength, kind="stable")
     strongest = limit - limit // 4
     rest = order[strongest:]
@@ -360,41 +380,41 @@ def local_sets(
 
 
 def score(
-    R: Floats,
-    t: Floats,
-    source: Float32Array,
-    target: Float32Array,
+    R: FloatArray,
+    t: FloatArray,
+    known: FloatArray,
     vote: Float32Array,
     surroundings: Surroundings | None = None,
-) -> Floats:
+) -> FloatArray:
     """Sum of vote x exp(-r^2 / (2 0.75^2)) over all correspondences for each motion, (K,).
 
     Residuals r in units of the inlier threshold; with surroundings each term is weighed by how well the
     normals meet. A smooth kernel, somewhat narrower than the threshold, told right from wrong better than a
     count or a truncated square.
     """
-    scores = np.empty(len(R), dtype=np.float32)
-    step = max(1, _SCORED_AT_ONCE // max(len(source), 1))
+    scores = np.empty(len(R))
+    step = max(1, _SCORED_AT_ONCE // max(len(known), 1))
     for start in range(0, len(R), step):
         part = slice(start, start + step)
-        kernel = squared_residuals(R[part], t[part], source, target)
-        kernel *= -0.5 / 0.75**2
+        kernel = squared_residuals_shared(R[part], t[part], known).astype(np.float32)
+        kernel *= np.float32(-0.5 / 0.75**2)
         np.exp(kernel, out=kernel)
         if surroundings is not None:
             kernel *= surroundings.matched(R[part])
-        scores[part] = np.einsum("kn,n->k", kernel, vote)
+        scores[part] = kernel @ vote
     return scores
 
 
 def refit(
-    R: Floats, t: Floats, source: Float32Array, target: Float32Array, vote: Float32Array
-) -> tuple[Floats, Floats]:
+    R: FloatArray, t: FloatArray, known: FloatArray, vote: Float32Array
+) -> tuple[FloatArray, FloatArray]:
     """One reweighted fit per motion on residuals under the threshold, weights vote / (1 + r^2).
 
     A motion left with fewer than three inliers stays as it is.
     """
-    r2 = squared_residuals(R, t, source, target)
-    weights = vote * (r2 < 1) / (1 + r2)
-    R_new, t_new = fit_rigid_shared(source, target, weights)
-    enough = (weights > 0).sum(1) >= 3
+    r2 = squared_residuals_shared(R, t, known)
+    weights = vote * (r2 < 1)
+    enough = np.count_nonzero(weights, axis=1) >= 3
+    r2 += 1
+    R_new, t_new = fit_rigid_shared(known, weights / r2)
     return np.where(enough[:, None, None], R_new, R), np.where(enough[:, None], t_new, t)

@@ -10,6 +10,7 @@ per scan where normals must be fitted to the keypoints, 10 ms for all pairs, 0.0
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -89,48 +90,58 @@ class Surroundings:
         n, m = self.normals
         return np.ascontiguousarray((m[:, :, None] * n[:, None, :]).reshape(-1, 9).T)
 
-    def pairs(
-        self, source: Float32Array, target: Float32Array, apart: Float32Array, rows: slice
-    ) -> Float32Array:
+    def of_pairs(
+        self, source: Float32Array, target: Float32Array
+    ) -> Callable[[slice, Float32Array], Float32Array]:
         """How well the planes of two correspondences lie to each other in both scans, in [0.1, 1].
 
         Args:
             source: (N, 3) points near zero, in inlier thresholds.
             target: (N, 3) likewise.
-            apart: (n, N) distances of the source points of ``rows`` from all.
-            rows: n of the correspondences.
 
         Returns:
-            (n, N).
+            Of n rows, and the distances (n, m) of their source points from those of the first of them and all after
+            it: (n, m).
         """
         places = [np.hstack([x, np.ones_like(x[:, :1])]) for x in (source, target)]
         planes = [
             np.hstack([n, -np.einsum("ni,ni->n", n, x)[:, None]])
             for n, x in zip(self.normals, (source, target), strict=True)
         ]
-        error = self._difference(planes, places, rows) ** 2  # height of each point over the plane of a row
-        error += self._difference(places, planes, rows) ** 2
         known = expert().surroundings
-        error /= np.maximum(apart, 1.0) ** 2 * np.float32(2 * known.plane_sigma**2)
-        turn = self._difference(self.normals, self.normals, rows)
-        turn *= turn
-        turn *= np.float32(0.5 / known.turn_sigma**2)
-        error += turn
-        np.negative(error, out=error)
-        np.exp(error, out=error)
-        error *= np.float32(1 - known.least_agreement)
-        error += np.float32(known.least_agreement)
-        return error
+
+        def agreement(rows: slice, apart: Float32Array) -> Float32Array:
+            error = self._difference(planes, places, rows)  # height of each point over the plane of a row
+            error *= error
+            other = self._difference(places, planes, rows)
+            other *= other
+            error += other
+            np.maximum(apart, 1.0, out=other)
+            other *= other
+            other *= np.float32(-2 * known.plane_sigma**2)
+            error /= other
+            turn = self._difference(self.normals, self.normals, rows)
+            turn *= turn
+            turn *= np.float32(-0.5 / known.turn_sigma**2)
+            error += turn
+            np.exp(error, out=error)
+            error *= np.float32(1 - known.least_agreement)
+            error += np.float32(known.least_agreement)
+            return error
+
+        return agreement
 
     def _difference(self, left: Any, right: Any, rows: slice) -> Float32Array:
-        """left right^T of the source minus that of the target; of magnitudes where signs mean nothing."""
+        """left right^T of the source minus that of the target, from the first row on; of magnitudes where signs mean
+        nothing."""
         found: Float32Array
+        rest = slice(rows.start, None)
         if self.signed:
             both = np.hstack([left[0][rows], -left[1][rows]])
-            found = both @ np.hstack([right[0], right[1]]).T
+            found = both @ np.hstack([right[0][rest], right[1][rest]]).T
             return found
-        found = np.abs(left[0][rows] @ right[0].T)
-        found -= np.abs(left[1][rows] @ right[1].T)
+        found = np.abs(left[0][rows] @ right[0][rest].T)
+        found -= np.abs(left[1][rows] @ right[1][rest].T)
         return found
 
     def matched(self, R: NDArray[Any]) -> Float32Array:
@@ -182,11 +193,10 @@ def _turned(points: FloatArray, R: NDArray[Any]) -> FloatArray:
 
 def _depth_in_front(view: RangeImage, points: FloatArray) -> FloatArray:
     """Mean over n points of (n, K, 3), for each K, of how far beyond the threshold they lie in front."""
-    flat = points.reshape(-1, 3)
-    seen, margin = view.margins(flat)
-    away = flat - view.viewpoint
+    margin, distance = view.margins(points.reshape(-1, 3))
     known = expert().surroundings
-    scale = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)) / known.near, 1.0)
-    depth = np.where(seen, np.clip(-margin / scale - 1, 0, known.deepest) / known.deepest, 0.0)
+    np.maximum(distance / known.near, 1.0, out=distance)  # what depths are shortened by
+    # Where nothing was seen the margin is infinite, and no depth in front.
+    depth = np.clip(-margin / distance - 1, 0, known.deepest) / known.deepest
     means: FloatArray = depth.reshape(points.shape[:2]).mean(0)
     return means

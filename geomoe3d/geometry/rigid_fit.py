@@ -41,24 +41,50 @@ def fit_rigid(source: Floats, target: Floats, weights: Floats) -> tuple[Floats, 
     return _motion(H, source_mean, target_mean)
 
 
-def fit_rigid_shared(source: Floats, target: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """`fit_rigid` for K weightings of the same N points, through their moments.
+def products(source: Floats, target: Floats) -> FloatArray:
+    """(N, 17) of correspondences p, q: p q^T (9), p, q, |p|^2 + |q|^2 and 1.
+
+    Squared residuals under any motion, and the moments of any weighting, are one matrix product with these.
 
     Args:
-        source: (N, 3) points, near their centroid (moments cancel badly far from it).
-        target: (N, 3) points, near their centroid.
+        source: (N, 3) points p, near their centroid (what is far from it cancels badly).
+        target: (N, 3) points q, likewise.
+    """
+    p, q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    both = (p[:, :, None] * q[:, None, :]).reshape(len(p), 9)
+    squares = (p * p).sum(1) + (q * q).sum(1)
+    return np.column_stack([both, p, q, squares, np.ones(len(p))])
+
+
+def fit_rigid_shared(rows: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`fit_rigid` for K weightings of the same N correspondences.
+
+    Args:
+        rows: (N, 17) their `products`.
         weights: (K, N) non-negative.
 
     Returns:
-        R (K, 3, 3), t (K, 3) as in `fit_rigid`.
+        R (K, 3, 3), t (K, 3) as in `fit_rigid`. Last bits are the same for any number of threads where BLAS keeps to
+        one.
     """
-    total = np.maximum(weights.sum(1), np.finfo(weights.dtype).tiny)[:, None]
-    products = (source[:, :, None] * target[:, None, :]).reshape(len(source), 9)
-    # einsum sums in one order for any number of threads; a matrix product does not.
-    moments = np.einsum("kn,nd->kd", weights, np.hstack([source, target, products])) / total
-    source_mean, target_mean = moments[:, :3], moments[:, 3:6]
-    H = moments[:, 6:].reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
-    return _motion(H, source_mean, target_mean)
+    sums = weights @ rows
+    moments = sums / np.maximum(sums[:, 16:], np.finfo(np.float64).tiny)
+    source_mean, target_mean = moments[:, 9:12], moments[:, 12:15]
+    H = moments[:, :9].reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
+    R, t = _motion(H, source_mean, target_mean)
+    return R.astype(np.float64, copy=False), t.astype(np.float64, copy=False)
+
+
+def squared_residuals_shared(R: Floats, t: Floats, rows: FloatArray) -> FloatArray:
+    """|R_k p_n + t_k - q_n|^2 for K motions and N correspondences, given their `products` (N, 17): (K, N).
+
+    Of points within 1e4 of their centroid they err by some 1e-8.
+    """
+    turned = 2 * np.einsum("kij,ki->kj", R, t)
+    squares = np.einsum("ki,ki->k", t, t)[:, None]
+    of_products = -2 * R.transpose(0, 2, 1).reshape(-1, 9)
+    found: FloatArray = np.hstack([of_products, turned, -2 * t, np.ones_like(squares), squares]) @ rows.T
+    return np.maximum(found, 0, out=found)
 
 
 def _motion(H: Floats, source_mean: Floats, target_mean: Floats) -> tuple[Floats, Floats]:

@@ -242,8 +242,8 @@ class Search:
         around = around[np.argsort(self._order[around])[: expert().locating.asked_back]]
         if not len(around):
             return 0.0
-        seen, margin = self._view.margins(transform_points(inverse(T), level.points[around]))
-        violation = float((margin < -4 * voxel).sum() / (seen.sum() + 0.05 * len(around)))
+        margin, _ = self._view.margins(transform_points(inverse(T), level.points[around]))
+        violation = float((margin < -4 * voxel).sum() / (np.isfinite(margin).sum() + 0.05 * len(around)))
         return agreement * float(np.exp(-expert().surfaces.violation_weight * violation))
 
     def _around(self, T: FloatArray, fully: bool) -> PreparedCloud:

@@ -65,8 +65,8 @@ class FreeSpace:
         points, seen, through = np.concatenate(known), 0.0, 0.0
         for k, T in sensors.items():
             if k in self._views:
-                sees, margins = self._views[k].margins(transform_points(inverse(T), points))
-                seen += float(sees.sum()) / expert().many_groups.seen_sample
+                margins, _ = self._views[k].margins(transform_points(inverse(T), points))
+                seen += float(np.isfinite(margins).sum()) / expert().many_groups.seen_sample
                 through += float((margins < -self._margin).sum()) / expert().many_groups.seen_sample
         return seen, through
 

@@ -166,9 +166,8 @@ def _ask(points: FloatArray, normals: FloatArray, surface: Surface, signed: bool
     found = {"near": near, "in_plane": plane, "normal": cosine}
     seen, front, on = np.zeros((3, len(points)))
     if surface.view is not None:
-        seen_mask, margin = surface.view.margins(points)
-        margin = np.where(seen_mask, margin, 0.0)
-        seen = seen_mask.astype(np.float64)
-        front = seen * np.clip(-margin - 1, 0, 8) / 8
+        margin, _ = surface.view.margins(points)
+        seen = np.isfinite(margin).astype(np.float64)
+        front = np.clip(-margin - 1, 0, 8) / 8
         on = seen * _kernel(margin**2)
     return {**found, "seen": seen, "in_front": front, "on_view": on}

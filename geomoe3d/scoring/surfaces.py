@@ -205,9 +205,7 @@ class Verifier:
         for view, points in ((self._target_view, moved), (self._source_view, back)):
             if view is None:
                 continue
-            seen, margins = (
-                values.reshape(points.shape[:2]) for values in view.margins(points.reshape(-1, 3))
-            )
-            through = (margins < -2 * self._threshold).sum(1)
-            total += through / (seen.sum(1) + expert().surfaces.visible_floor * points.shape[1])
+            margins = view.margins(points.reshape(-1, 3))[0].reshape(points.shape[:2])
+            through, seen = (some.sum(1) for some in (margins < -2 * self._threshold, np.isfinite(margins)))
+            total += through / (seen + expert().surfaces.visible_floor * points.shape[1])
         return total

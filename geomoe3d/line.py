@@ -6,7 +6,7 @@ matches of a second descriptor, with more matches, on coarser grids, and with no
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
@@ -21,20 +21,20 @@ from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
-from geomoe3d.decision.causes import Register, differing_units, mirrored_axes
+from geomoe3d.decision.causes import Register, differing_units, is_sure, mirrored_axes
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
-from geomoe3d.decision.scale import measure_scale
+from geomoe3d.decision.scale import Scale, measure_scale
 from geomoe3d.decision.selection import Selection
 from geomoe3d.features.base import mirrored
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
-from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
-from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, PointCloud
+from geomoe3d.types import Accuracy, FilterOutput, FloatArray, Hypothesis, PointCloud
 
 
 class Look(NamedTuple):
@@ -43,6 +43,17 @@ class Look(NamedTuple):
     pair: Pair
     weighed: FilterOutput
     decision: Decision
+
+    def scale(self) -> Scale | None:
+        """See `measure_scale`."""
+        return measure_scale(self.decision.T_target_source, *self.pair.clouds)
+
+    def accuracy(self) -> Accuracy | None:
+        """See `measure_accuracy`."""
+        pair = self.pair
+        return measure_accuracy(
+            self.decision.T_target_source, *pair.clouds, pair.matched, pair.inlier_threshold
+        )
 
 
 @dataclass
@@ -99,16 +110,23 @@ class Line:
         prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock, sides)
         look = self._best(clouds, prepared, places, sides)
         clock("decide")
-        decision = look.decision
+        if look.decision.answer is not None:
+            look = look._replace(decision=self._made_parallel(look.pair, look.decision))
+        decision, agreeing = look.decision, self._mirrored_agreement(prepared, places)
+        asks_mirrored = config.second_look.mirror and self.again is not None
+        # None of these needs the others, so they are had side by side.
+        tasks: list[Callable[[], Any]] = [] if decision.answer is None else [look.scale, look.accuracy]
+        if asks_mirrored and not is_sure(decision.judgement):
+            tasks.append(agreeing)
+        with single_blas_thread():
+            found = each(lambda task: task(), tasks)
         if decision.answer is not None:
-            decision = self._made_parallel(look.pair, decision)
-            scale = measure_scale(decision.T_target_source, *look.pair.clouds)
-            decision = decision.with_scale(scale, exchanged=exchanged)
+            decision = replace(decision, accuracy=found[1]).with_scale(found[0], exchanged=exchanged)
         if decision.judgement.status != "ok":
             units = self._units(clouds[::-1] if exchanged else clouds)
             decision = decision if units is None else decision.with_note(units, first=True)
-        if config.second_look.mirror and self.again is not None:
-            mirrored = self._mirrored(prepared, places, decision)
+        if asks_mirrored and not is_sure(decision.judgement):
+            mirrored = self._mirrored(prepared, places, decision, agreeing)
             decision = decision if mirrored is None else decision.doubted(mirrored)
         told_of = remarks(
             data, look.pair.clouds, wanted, places is not None, config.preparation, decision.judgement
@@ -135,22 +153,24 @@ class Line:
                 best = other
         return best
 
-    def _mirrored(self, prepared: Clouds, places: Places, decision: Decision) -> str | None:
+    def _mirrored_agreement(self, prepared: Clouds, places: Places) -> Callable[[], float]:
+        """Which share of matches of the mirrored source the best of a few motions brings together; asked once."""
+        return cache(lambda: self.pipeline.agreeing(*self._mirror(prepared, places), StageClock()))
+
+    def _mirror(self, prepared: Clouds, places: Places) -> tuple[Clouds, Places]:
+        """Both clouds, the source mirrored, and their sensors."""
+        source, target = mirrored(prepared[0], self.pipeline.descriptor), prepared[1]
+        believed = None if places is None or source.viewpoint is None else (source.viewpoint, places[1])
+        return (source, target), believed
+
+    def _mirrored(
+        self, prepared: Clouds, places: Places, decision: Decision, agreeing: Callable[[], float]
+    ) -> str | None:
         """A sentence where the clouds fit clearly better with the source mirrored; see `mirrored_axes`."""
-        describe, clock = self.pipeline.descriptor, StageClock()
-
-        @cache
-        def pair() -> tuple[Clouds, Places]:
-            source, target = mirrored(prepared[0], describe), prepared[1]
-            believed = None if places is None or source.viewpoint is None else (source.viewpoint, places[1])
-            return (source, target), believed
-
-        def agreeing() -> float:
-            return self.pipeline.agreeing(*pair(), clock)
 
         def look() -> Decision:
-            alone = replace(self, clock=clock, initial=None, given=None, again=None, once=True)
-            return alone._look(*pair()).decision
+            alone = replace(self, clock=StageClock(), initial=None, given=None, again=None, once=True)
+            return alone._look(*self._mirror(prepared, places)).decision
 
         return mirrored_axes(decision, prepared[0].name, agreeing, look, self.clock)
 
@@ -242,10 +262,8 @@ class Line:
     def _finished(self, look: Look, clouds: tuple[PointCloud, PointCloud]) -> Explanation:
         """The result of a look, with what led to it."""
         pair, weighed, decision = look
-        if decision.answer is not None:
-            T = decision.T_target_source
-            accuracy = measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold)
-            decision = replace(decision, accuracy=accuracy)
+        if decision.answer is not None and decision.accuracy is None:
+            decision = replace(decision, accuracy=look.accuracy())
         if NETWORK in self.pipeline.scorers:
             opinion = opinion_of(decision.answer)
             said = None if opinion is None else opinion.output

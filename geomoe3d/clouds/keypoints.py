@@ -40,12 +40,14 @@ class Surface:
     @classmethod
     def of(cls, points: FloatArray, viewpoint: FloatArray | None) -> Surface:
         """Normals by a plane through the nearest points."""
+        import small_gicp
         from scipy.spatial import cKDTree
 
-        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
         k = min(expert().keypoints.normal_neighbors, len(points))
-        _, near = tree.query(points, k=k)
-        patch = points[np.asarray(near).reshape(len(points), k)]
+        # Twice as fast at finding several; the other one is at finding what lies within a reach.
+        near, _ = small_gicp.KdTree(small_gicp.PointCloud(points)).batch_knn_search(points, k)
+        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        patch = points[near.reshape(len(points), k)]
         patch = patch - patch.mean(1, keepdims=True)
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", patch, patch))
         normals = vectors[:, :, 0]

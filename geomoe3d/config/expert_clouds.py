@@ -33,7 +33,7 @@ class PreparationExpert(Section):
         "looked at when a voxel size is chosen: density is known well enough by then",
     )
     spacing_sample: int = constant(
-        20_000, "points", (2000, 100_000_000), "nearest to the middle, of which the spacing is measured"
+        8000, "points", (2000, 100_000_000), "nearest to the middle, of which the spacing is measured"
     )
     most_extent_ratio: int = constant(
         50, "ratio", (2, 1_000_000), "of two clouds' extents; beyond it one is in another unit"

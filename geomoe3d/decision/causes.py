@@ -7,6 +7,7 @@ from collections.abc import Callable
 from geomoe3d.clouds.prepare import robust_extent
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision
+from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.scale import likely_unit_ratio, seeming_units
 from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError
@@ -43,6 +44,11 @@ def differing_units(
     )
 
 
+def is_sure(judgement: Judgement) -> bool:
+    """Whether an answer is so sure that nothing is asked about mirrored axes."""
+    return judgement.status == "ok" and judgement.confidence > expert().causes.sure
+
+
 def mirrored_axes(
     decision: Decision,
     name: str,
@@ -52,8 +58,6 @@ def mirrored_axes(
 ) -> str | None:
     """A sentence where the clouds fit clearly better once the source is mirrored, else None.
 
-    Nothing is asked where the answer is quite sure.
-
     Args:
         decision: about the clouds as they are.
         name: of the source.
@@ -61,9 +65,7 @@ def mirrored_axes(
         look: decides about the mirrored source; asked only where that share is more than chance gives.
         clock: told of the stage.
     """
-    judgement, known = decision.judgement, expert().causes
-    if judgement.status == "ok" and judgement.confidence > known.sure:
-        return None
+    known = expert().causes
     clock("mirrored")
     if agreeing() < known.mirrored_support:
         return None

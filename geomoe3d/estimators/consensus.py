@@ -65,6 +65,8 @@ class ConsensusEstimator(Estimator):
             supported, and a quarter spread over the others.
         num_refined: distinct proposals that are refined before the choice, at least ``num_hypotheses``.
         num_refits: rounds of reweighted refinement before the choice, and as many of the chosen after it.
+        still_turn, still_shift: what moves less in a round, an entry of the rotation and inlier thresholds, is at its
+            end.
         distinct_angle_deg, distinct_thresholds: two motions are the same when they differ by less than
             this angle and, at the centroid, by less than so many inlier thresholds.
         settled_share, settled_lead: where the best motion has so many votes for each correspondence, and so many
@@ -83,6 +85,8 @@ class ConsensusEstimator(Estimator):
     num_witnesses: int = 300
     num_refined: int = 100
     num_refits: int = 2
+    still_turn: float = 5e-5
+    still_shift: float = 1e-3
     distinct_angle_deg: float = 15.0
     distinct_thresholds: float = 3.0
     settled_share: float = 0.04
@@ -139,8 +143,7 @@ class ConsensusEstimator(Estimator):
         for limit, refits in ((most, self.num_refits), (some, 10)):
             keep = self._distinct_rows(R, t, scores, limit)
             R, t = R[keep], t[keep]
-            for _ in range(refits):
-                R, t = refit(R, t, known, vote)
+            R, t = self._refitted(R, t, known, vote, refits)
             scores = score(R, t, known, vote, surroundings)
             if surroundings is not None:
                 scores = scores * surroundings.plausibility(R, _shift(R, t, centre / inlier_threshold))
@@ -212,9 +215,24 @@ class ConsensusEstimator(Estimator):
             return False
         best = self._distinct_rows(R, t, scores, self.num_tried)
         R, t = R[best], t[best]
-        for _ in range(self.num_refits):
-            R, t = refit(R, t, known, vote)
+        R, t = self._refitted(R, t, known, vote, self.num_refits)
         return self._is_settled(R, t, score(R, t, known, vote, surroundings), len(vote))
+
+    def _refitted(
+        self, R: FloatArray, t: FloatArray, known: FloatArray, vote: Float32Array, rounds: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Motions after so many rounds of `refit`; one that stays where it is takes part in no further one."""
+        R, t = R.copy(), t.copy()
+        moving = np.arange(len(R))
+        for _ in range(rounds):
+            R_new, t_new = refit(R[moving], t[moving], known, vote)
+            turned = np.abs(R_new - R[moving]).max((1, 2)) > self.still_turn
+            shifted = np.abs(t_new - t[moving]).max(1) > self.still_shift
+            R[moving], t[moving] = R_new, t_new
+            moving = moving[turned | shifted]
+            if not len(moving):
+                break
+        return R, t
 
     def _distinct_rows(self, R: FloatArray, t: FloatArray, scores: FloatArray, limit: int) -> list[int]:
         """Greedy choice by score; each pick takes all motions close to it out of the race."""

@@ -50,7 +50,7 @@ NUM_CHANNELS = len(CHANNELS)
 PRIOR_KERNEL = math.exp(-0.5 / 0.75**2)
 """The channel ``residual`` at a residual of one inlier threshold: the network's first prior is what lies below."""
 _MOST_ANCHORS = 1000
-_ROWS_AT_ONCE = 250
+_ROWS_AT_ONCE = 125
 _REACH = 3.0  # inlier thresholds in which a surface point of the other scan is sought
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import EmptyCloudError, InputError
-from geomoe3d.geometry.columns import extents
+from geomoe3d.geometry.columns import bounds, extents, in_cache
 from geomoe3d.geometry.draws import OFF_ROUND, mixed
 from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.threads import each, usable_threads
@@ -183,8 +183,8 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     goal = min(num_points, max(len(sample) // 2, 1))
 
     def count(step: int) -> float:
-        weights, _, starts = _by_voxel(sample, 2.0 ** (step / 2))
-        return float(np.minimum(np.add.reduceat(weights, starts) / expert().preparation.full, 1).sum())
+        weights, numbers = _by_voxel(sample, 2.0 ** (step / 2))
+        return float(np.minimum(np.bincount(numbers, weights) / expert().preparation.full, 1).sum())
 
     coarsest = int(np.ceil(2 * np.log2(extent)))
     step = min(round(2 * np.log2(extent / np.sqrt(goal))), coarsest)
@@ -239,9 +239,10 @@ def typical_spacing(points: FloatArray) -> float:
 
     # All points of a part keep their density; a thinned cloud would look sparser than it is.
     middle = np.median(points[:: max(1, len(points) // 20_000)], axis=0)
-    away = np.abs(points[:, 0] - middle[0])
-    for column, at in zip(points.T[1:], middle[1:], strict=True):
-        np.maximum(away, np.abs(column - at), out=away)
+    away: FloatArray = np.zeros(len(points))
+    for rows in in_cache(len(points)):
+        for column, at in zip(points[rows].T, middle, strict=True):
+            np.maximum(away[rows], np.abs(column - at), out=away[rows])
     sample = expert().preparation.spacing_sample
     if len(points) > sample:
         away_limit = np.partition(away, sample)[sample]
@@ -260,12 +261,13 @@ def drop_duplicates(points: FloatArray) -> tuple[FloatArray, int]:
     """Points without exact repetitions, first ones kept in order, and how many were dropped."""
     # A 64-bit mix of the coordinates' bits sorts five times faster than rows do; two different points
     # share it with a chance of about 1e-6 at 5 million points.
-    bits = (points + 0.0).view(np.uint64)  # + 0.0 makes -0.0 equal to 0.0
     mixed = np.zeros(len(points), dtype=np.uint64)
-    for axis, factor in enumerate((0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)):
-        column = bits[:, axis] * np.uint64(factor)
-        mixed ^= column ^ (column >> np.uint64(29))
-        mixed *= np.uint64(0xBF58476D1CE4E5B9)
+    for rows in in_cache(len(points)):
+        bits = (points[rows] + 0.0).view(np.uint64)  # + 0.0 makes -0.0 equal to 0.0
+        for axis, factor in enumerate((0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)):
+            column = bits[:, axis] * np.uint64(factor)
+            mixed[rows] ^= column ^ (column >> np.uint64(29))
+            mixed[rows] *= np.uint64(0xBF58476D1CE4E5B9)
     ordered = np.sort(mixed)  # half the time of an order; most clouds have no duplicates
     if not (ordered[1:] == ordered[:-1]).any():
         return points, 0
@@ -280,18 +282,22 @@ def voxel_keys(points: FloatArray, voxel_size: float, shift: float = 0.0) -> Int
         InputError: the cloud spans more than 2^21 voxels along an axis.
     """
     limit = 2**_BITS
+    first, last = (np.floor(corner / voxel_size - shift) for corner in bounds(points))
+    if (last - first).max() >= limit:
+        extent = float(extents(points).max())
+        raise InputError(
+            f"voxel size {voxel_size:.4g} is too small for a cloud of extent {extent:.4g}: more than "
+            f"{limit} voxels along one axis; use at least {extent / limit:.3g} or remove stray points"
+        )
+    # No more bits than needed: small keys are sorted in fewer steps.
+    widths = [int(cells).bit_length() for cells in last - first]
     keys: IntArray = np.zeros(len(points), dtype=np.int64)
-    for column in points.T:
-        cells = np.floor(column / voxel_size - shift)
-        cells -= cells.min()
-        if cells.max() >= limit:
-            extent = float(extents(points).max())
-            raise InputError(
-                f"voxel size {voxel_size:.4g} is too small for a cloud of extent {extent:.4g}: more than "
-                f"{limit} voxels along one axis; use at least {extent / limit:.3g} or remove stray points"
-            )
-        keys <<= int(cells.max()).bit_length()  # no more than needed: small keys are sorted in fewer steps
-        keys |= cells.astype(np.int64)
+    for rows in in_cache(len(points)):
+        for column, lowest, bits in zip(points[rows].T, first, widths, strict=True):
+            cells = np.floor(column / voxel_size - shift)
+            cells -= lowest
+            keys[rows] <<= bits
+            keys[rows] |= cells.astype(np.int64)
     return keys
 
 
@@ -324,11 +330,12 @@ def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
     """
     from scipy.spatial import cKDTree
 
-    weights, order, starts = _by_voxel(points, voxel_size)
-    sums = np.add.reduceat(weights, starts)
-    # One coordinate at a time: numpy adds rows of three a third as fast.
-    columns = [np.add.reduceat(column[order] * weights, starts) / sums for column in points.T]
-    means: FloatArray = np.stack(columns, axis=1)
+    weights, numbers = _by_voxel(points, voxel_size)
+    sums = np.bincount(numbers, weights)
+    held = np.flatnonzero(sums)
+    columns = [np.bincount(numbers, column * weights)[held] for column in points.T]
+    sums = sums[held]
+    means: FloatArray = np.stack(columns, axis=1) / sums[:, None]
     kept = sums >= expert().preparation.least_held
     thin = np.flatnonzero(~kept)
     if not kept.any():
@@ -339,19 +346,27 @@ def voxel_means(points: FloatArray, voxel_size: float) -> FloatArray:
     return means[kept]
 
 
-def _by_voxel(points: FloatArray, voxel_size: float) -> tuple[FloatArray, IntArray, IntArray]:
-    """Weights in a voxel, see `voxel_means`, and rows of the points, both by voxel, and where each voxel starts."""
-    keys = voxel_keys(points, voxel_size, OFF_ROUND)
-    order = sorted_rows(keys)
-    keys = keys[order]
-    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    inside: FloatArray = np.full(len(points), 0.5)
-    for column in points.T:
-        place = column / voxel_size - OFF_ROUND
-        place -= np.floor(place) + 0.5
-        np.minimum(inside, 0.5 - np.abs(place, out=place), out=inside)
+def _by_voxel(points: FloatArray, voxel_size: float) -> tuple[FloatArray, IntArray]:
+    """Weights in a voxel, see `voxel_means`, never zero, and numbers of the voxels, rising with their keys; some may be
+    left out."""
     known = expert().preparation
-    return np.clip(inside[order] / known.ramp, known.at_wall, 1), order, starts
+    weights: FloatArray = np.empty(len(points))
+    for rows in in_cache(len(points)):
+        inside = weights[rows]
+        inside[:] = 0.5
+        for column in points[rows].T:
+            place = column / voxel_size - OFF_ROUND
+            place -= np.floor(place) + 0.5
+            np.minimum(inside, 0.5 - np.abs(place, out=place), out=inside)
+        inside /= known.ramp
+        np.clip(inside, known.at_wall, 1, out=inside)
+    keys = voxel_keys(points, voxel_size, OFF_ROUND)
+    if keys.max() < len(keys):
+        return weights, keys
+    order = sorted_rows(keys)
+    numbers = np.empty_like(keys)
+    numbers[order] = np.cumsum(np.diff(keys[order], prepend=keys[order[0]]) > 0)
+    return weights, numbers
 
 
 def drop_isolated(points: FloatArray, radius: float) -> FloatArray:

@@ -48,9 +48,8 @@ class Explanation:
         result, source = self.result.inverse(), self.target
         other = result.alternative
         if other is not None:
-            shift, _ = motions_apart(
-                result.T_target_source, other.T_target_source, source.file_points.mean(axis=0)
-            )
+            center = source.origin + [column.mean() for column in source.points.T]
+            shift, _ = motions_apart(result.T_target_source, other.T_target_source, center)
             result = replace(result, alternative=replace(other, translation_difference=shift))
         return replace(
             self,

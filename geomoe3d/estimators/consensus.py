@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
-_PAIRED = 125  # the same where several such blocks are worked on
+_PAIR_BLOCK = 125  # the same where several such blocks are worked on
 _SCORED_AT_ONCE = 64_000
 
 
@@ -247,7 +247,7 @@ class ConsensusEstimator(Estimator):
             return found
 
         keep: list[int] = []
-        for some in _blocks(np.argsort(-scores, kind="stable"), _PAIRED):
+        for some in _blocks(np.argsort(-scores, kind="stable"), _PAIR_BLOCK):
             free = some[~close(some, keep).any(1)]
             among, left = close(free, free), np.ones(len(free), dtype=np.bool_)
             for row in range(len(free)):
@@ -342,7 +342,7 @@ def compatibility(
             whole[rows, rest] = part
             whole[rest, rows] = part.T
 
-    each(fill, _blocks(np.arange(len(source)), _PAIRED))
+    each(fill, _blocks(np.arange(len(source)), _PAIR_BLOCK))
     np.fill_diagonal(compatible, 0)
     return apart, compatible
 

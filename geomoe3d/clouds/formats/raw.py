@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError
+from geomoe3d.geometry.columns import in_cache
 from geomoe3d.types import FloatArray, IntArray
 
 CHUNK_BYTES = 1 << 24
@@ -132,8 +133,9 @@ def cloud_of(
 def _side_by_side(columns: Sequence[NDArray[Any]], kind: Any) -> NDArray[Any]:
     """Columns (N,) as (N, C), of a given type or that of all."""
     table: NDArray[Any] = np.empty((len(columns[0]), len(columns)), dtype=kind or np.result_type(*columns))
-    for k, column in enumerate(columns):
-        table[:, k] = column
+    for rows in in_cache(len(table)):
+        for k, column in enumerate(columns):
+            table[rows, k] = column[rows]
     return table
 
 

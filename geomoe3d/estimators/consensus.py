@@ -14,8 +14,7 @@ distinct hypotheses are kept for a later choice on the clouds; and what surround
 of pairs and of motions (`geomoe3d.estimators.surroundings`), without which lengths alone decide.
 
 Place: solve. Cost for N correspondences, M seeds and W witnesses: O(N^2) memory (4 bytes each, N at most
-``max_dense``), M N W multiply-adds; 1,000 take some 50 ms on one core, 35 on two, a third of it for what
-surrounds them.
+``max_dense``), M N W multiply-adds; 1,000 take some 27 ms on one core, a third of it for what surrounds them.
 """
 
 from __future__ import annotations

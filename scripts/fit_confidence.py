@@ -29,6 +29,7 @@ from geomoe3d.decision.confidence import CONFIDENCE_INPUTS, confidence_inputs
 from geomoe3d.decision.information import Information
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.evaluation.metrics import is_right, motion_errors
+from geomoe3d.geometry.se3 import inverse
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
 from geomoe3d.scoring.surfaces import Evidence
@@ -41,10 +42,11 @@ LOOKS = (
     ["second_look.below=1.0", "decision.min_confidence=1.0"],
 )
 """Settings by which a pair gets one look, and always two."""
+Drawn = tuple[str, str, str, list[Any] | None, bool]
 
 
-def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str, str, list[Any] | None]]:
-    """(scene, source, target, true motion or None), the same for the same folders and counts.
+def draw(folders: list[str], count: int, unrelated: int) -> list[Drawn]:
+    """(scene, source, target, true motion or None, whether related), the same for the same folders and counts.
 
     Of the unrelated ones every second is of one scene, two fragments that no list says to overlap: furniture that
     stands twice and walls at right angles imitate each other more than two buildings do.
@@ -56,33 +58,42 @@ def draw(folders: list[str], count: int, unrelated: int) -> list[tuple[str, str,
             by_scene.setdefault(f"{folder}/{pair.scene}", []).append(pair)
     everything = [(scene, pair) for scene, pairs in sorted(by_scene.items()) for pair in pairs]
     total = sum(share for _, _, share in BANDS)
-    chosen: list[tuple[str, str, str, list[Any] | None]] = []
+    chosen: list[Drawn] = []
     for low, high, share in BANDS:
         band = [e for e in everything if e[1].overlap is not None and low <= e[1].overlap < high]
         for k in rng.permutation(len(band))[: round(count * share / total)]:
             scene, pair = band[k]
-            chosen.append((scene, str(pair.source), str(pair.target), pair.T_target_source.tolist()))
+            chosen.append((scene, str(pair.source), str(pair.target), pair.T_target_source.tolist(), True))
     names = sorted(by_scene)
     apart = [pair for scene in names for pair in unlisted(scene, by_scene[scene])]
     for k in rng.permutation(len(apart))[: unrelated // 2]:
-        chosen.append((*apart[k], None))
+        chosen.append((*apart[k], False))
     for _ in range(unrelated - unrelated // 2):
         a, b = rng.choice(len(names), 2, replace=False)
         source, target = (by_scene[names[k]][rng.integers(len(by_scene[names[k]]))].source for k in (a, b))
-        chosen.append((f"{names[a]} {names[b]}", str(source), str(target), None))
+        chosen.append((f"{names[a]} {names[b]}", str(source), str(target), None, False))
     return [chosen[k] for k in rng.permutation(len(chosen))]
 
 
-def unlisted(scene: str, pairs: list[PosedPair]) -> list[tuple[str, str, str]]:
-    """(scene, source, target) of every two fragments of a scene that no list says to overlap."""
+def unlisted(scene: str, pairs: list[PosedPair]) -> list[tuple[str, str, str, list[Any]]]:
+    """(scene, source, target, true motion) of every two fragments of a scene that no list says to overlap, as far as
+    the lists lead from one to the other. They may share a little all the same, and be registered rightly."""
+    poses = {pairs[0].source: np.eye(4)}
+    for _ in pairs:
+        for pair in pairs:
+            if pair.target in poses:
+                poses.setdefault(pair.source, poses[pair.target] @ pair.T_target_source)
+            elif pair.source in poses:
+                poses[pair.target] = poses[pair.source] @ inverse(pair.T_target_source)
     listed = {frozenset((pair.source, pair.target)) for pair in pairs}
-    clouds = sorted(set().union(*listed))
-    return [(scene, str(a), str(b)) for a, b in combinations(clouds, 2) if frozenset((a, b)) not in listed]
+    return [
+        (scene, str(a), str(b), (inverse(poses[b]) @ poses[a]).tolist())
+        for a, b in combinations(sorted(poses), 2)
+        if frozenset((a, b)) not in listed
+    ]
 
 
-def measure(
-    pairs: list[tuple[str, str, str, list[Any] | None]], out: Path, assignments: list[str]
-) -> list[dict[str, Any]]:
+def measure(pairs: list[Drawn], out: Path, assignments: list[str]) -> list[dict[str, Any]]:
     """One record per pair and look; those in the file are kept."""
     out.parent.mkdir(parents=True, exist_ok=True)
     lines = out.read_text().splitlines() if out.exists() else []
@@ -93,7 +104,7 @@ def measure(
     }
     registrars = [Registrar(load_config(None, [*assignments, *look])) for look in LOOKS]
     with out.open("a") as file:
-        for number, (scene, source, target, T) in enumerate(pairs):
+        for number, (scene, source, target, T, related) in enumerate(pairs):
             for look, registrar in enumerate(registrars):
                 if (source, target, look) in known:
                     continue
@@ -107,7 +118,7 @@ def measure(
                     "target": target,
                     "look": look,
                     "assignments": assignments,
-                    "related": T is not None,
+                    "related": related,
                     "right": right,
                     "status": result.status,
                     "lead": lead_of(result),
@@ -121,7 +132,7 @@ def measure(
                 file.flush()
                 if number % 25 == 0:
                     print(f"{number} of {len(pairs)}", flush=True)
-    return [known[(source, target, look)] for _, source, target, _ in pairs for look in range(len(LOOKS))]
+    return [known[(source, target, look)] for _, source, target, *_ in pairs for look in range(len(LOOKS))]
 
 
 def lead_of(result: RegistrationResult) -> float:

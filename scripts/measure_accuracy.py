@@ -34,7 +34,7 @@ Row = tuple[float, float, float]
 
 
 def generated(folders: list[str], count: int) -> Iterator[tuple[Any, Any, FloatArray]]:
-    for _, source, target, T in draw(folders, count, 0):
+    for _, source, target, T, _ in draw(folders, count, 0):
         yield load_fragment(Path(source)), load_fragment(Path(target)), np.array(T)
 
 

@@ -87,7 +87,7 @@ def test_what_differs_is_never_ok_and_what_is_not_believed_has_no_scale() -> Non
         Decision.failed(""), answer=Hypothesis(np.eye(4)), judgement=Judgement("ok", ("so",), 0.99)
     )
     told = sure.with_scale(Scale(1.1, 0.01)).judgement
-    assert told.status == "low_confidence" and told.confidence <= 0.5
+    assert told.status == "low_confidence" and told.confidence < 0.8
     assert "1.1 times" in told.reasons[0] and told.reasons[1:] == ("so",)
     for fine in (Scale(1.1, 0.08), Scale(1.05, 0.02), Scale(1.005, 0.0001), None):
         assert sure.with_scale(fine).judgement == sure.judgement

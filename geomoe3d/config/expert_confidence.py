@@ -87,10 +87,11 @@ class ConfidenceExpert(Section):
     )
     most_sliding: float = constant(0.3, "probability", (0, 1), "most confidence where the source can slide")
     most_doubted: float = constant(
-        0.5,
+        0.79,
         "probability",
         (0, 1),
         "most confidence of an answer with an equal rival, or that too little agrees with",
+        "below what ends a second look; of 101 such answers of recorded pairs 93 were right, of 16 others 14",
     )
     least_observability: float = constant(0.005, "-", (0, 1 / 3), "below which the source can slide")
     coinciding_sensors: float = constant(

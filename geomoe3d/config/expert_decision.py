@@ -188,7 +188,7 @@ class CausesExpert(Section):
         0.3, "probability", (0, 1), "an answer of less confidence says nothing of the scale"
     )
     most_doubted: float = constant(
-        0.5,
+        0.79,
         "probability",
         (0, 1),
         "most confidence of an answer whose scale differs or whose source is mirrored",

@@ -72,6 +72,9 @@ class ManyGroupsExpert(Section):
     rounds: int = constant(10, "rounds", (1, 1000), "of messages between edges")
     damping: float = constant(0.5, "-", (0, 1), "of what a round changes")
     least_confidence: float = constant(0.02, "probability", (0, 1), "edges below take no part")
+    most_ambiguous: float = constant(
+        0.5, "probability", (0, 1), "confidence of an edge with an equal rival: most pairs share nothing"
+    )
     most_log_odds: float = constant(7.0, "log-odds", (0, 100), "of an edge by its confidence")
     unrelated: float = constant(
         1.0, "log-odds", (-100, 100), "taken off: the confidence is that of pairs of which most overlap"

@@ -103,7 +103,8 @@ def edge_of(
     floor = expert().many_groups.least_observability * matched
     radius_squared = max(float(np.trace(shapes[source].spread)), 1e-12)
     information += floor * np.diag([radius_squared] * 3 + [1.0] * 3)
-    return Edge(source, target, T, result.confidence, information, looseness)
+    most = expert().many_groups.most_ambiguous if result.status == "ambiguous" else 1.0
+    return Edge(source, target, T, min(result.confidence, most), information, looseness)
 
 
 def differences(

@@ -92,7 +92,7 @@ class Line:
             exchanged: whether the user calls the second of them the source.
         """
         config, clock = self.config, self.clock
-        clock("prepare")
+        clock("preprocess")
         wanted = config.voxel_size
         if wanted is None:
             sizes = own_voxel_sizes(*clouds, config.preparation.voxel_points)

@@ -137,7 +137,14 @@ class Registry(Generic[PartType]):
         Raises:
             ConfigError: as `find`, or settings that it does not take.
         """
-        return self.find(config.name).from_config(config)
+        part = self.find(config.name)
+        own = part.from_config.__func__ is Part.from_config.__func__  # type: ignore[attr-defined]
+        if config.options and not own and ":" not in config.name:
+            raise ConfigError(
+                f"options {dict(config.options)} are given, but the {self.kind} '{config.name}' takes none; they are "
+                "for a class of your own"
+            )
+        return part.from_config(config)
 
     def _own(self, name: str) -> type[PartType]:
         found, base = load_object(name, f"a {self.kind}"), self._base()

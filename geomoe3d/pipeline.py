@@ -98,7 +98,7 @@ class Pipeline:
         seed, describe = self.config.seed, self.descriptor
 
         def make() -> PreparedCloud:
-            clock("prepare")
+            clock("preprocess")
             made = prepare(cloud, voxel_size, config, viewpoint=viewpoint, seed=seed)
             clock("features")
             return with_features(made, describe)
@@ -136,7 +136,7 @@ class Pipeline:
             config, viewpoint = self._preparation(one[1], sides)
             return prepare(one[0], voxel_size, config, viewpoint=viewpoint, seed=self.config.seed)
 
-        clock("prepare")
+        clock("preprocess")
         made = each(on_grid, both)
         clock("features")
         first, second = (with_features(cloud, self.descriptor) for cloud in made)

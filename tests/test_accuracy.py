@@ -129,7 +129,24 @@ def test_the_words_name_each_figure() -> None:
     assert facts["distance"] == "mean 0.01, median 0.008, standard deviation 0.007, 95 % within 0.025"
     assert "4 and 12 mm if the unit is the metre" in facts["uncertainty"]
     assert "0.11 deg" in facts["uncertainty"]
+    for factor in (1e3, 1e-9):  # not metres: no word of millimetres, above all not of a million of them
+        other = replace(
+            FOUND, sigma_center=factor * FOUND.sigma_center, sigma_farthest=factor * FOUND.sigma_farthest
+        )
+        words = dict(accuracy_facts(replace(room_view().result, accuracy=other)))["uncertainty"]
+        assert "mm" not in words
+    none = dict(
+        accuracy_facts(replace(room_view().result, accuracy=replace(FOUND, inlier_rmse=float("nan"))))
+    )
+    assert none["inlier RMSE"] == "none: no correspondence is an inlier"
     assert dict(accuracy_facts(room_view().result)) == {"overlap": "60% of the source"}
+
+
+def test_the_paragraph_and_the_figures_name_one_overlap() -> None:
+    result = replace(room_view().result, accuracy=replace(FOUND, overlap_source=0.667), overlap=0.6787)
+    assert dict(accuracy_facts(result))["overlap"].startswith("67% of the source")
+    assert "67% of the source lies on the target" in repr(result)
+    assert "68% of the source lies on the target" in repr(replace(result, accuracy=None))
 
 
 def test_the_picture_tells_inliers_from_outliers_whatever_a_filter_kept() -> None:

@@ -48,7 +48,7 @@ def test_summary_tells_everything_and_is_plain_where_nobody_sees_colours(scan_fi
         "1,234 of 4,321 correspondences within 0.11",
         "0.055 (chosen from the clouds",
         "source.xyz: 81,234 points in, 4,900 voxel points used; "
-        "dropped 12 non-finite, 7 duplicates, 3 isolated voxels",
+        "dropped 12 points with NaN or infinite coordinates, 7 duplicates, 3 isolated voxels",
         "target.xyz: 71,000 points in, 4,100 voxel points used; nothing dropped",
         "runner-up   83 % of the score, differs by 92.1 deg and 1.25",
         "load 0.25, match 1.50, total 1.75",

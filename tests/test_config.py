@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+import geomoe3d
 from geomoe3d.config import (
     RegistrationConfig,
     Section,
@@ -246,3 +249,61 @@ def test_shipped_configurations_are_found_by_name_from_anywhere(tmp_path, monkey
 def test_a_missing_configuration_names_the_nearest_that_comes_with_the_package():
     with pytest.raises(FileNotFoundError, match=r"did you mean configs/train/motions\.yaml"):
         load_config("configs/train/motion.yaml")
+
+
+def test_a_key_that_stands_twice_in_a_file_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "twice.yaml"
+    file.write_text("decision:\n  min_confidence: 0.9\n  min_confidence: 0.2\n")
+    with pytest.raises(ConfigError, match=r"twice\.yaml.*'decision\.min_confidence' more than once"):
+        load_config(file)
+    file.write_text("decision:\n  min_confidence: 0.9\nseed: 3\n")
+    assert load_config(file).decision.min_confidence == 0.9
+
+
+def test_a_key_of_a_section_leaves_its_others_as_they_are_by_default() -> None:
+    usual = RegistrationConfig().expert.confidence
+    changed = load_config(None, ["expert.confidence.with_network.offset=-2"]).expert.confidence
+    assert changed.with_network.offset == -2
+    assert changed.with_network.slopes == usual.with_network.slopes != (0.0,) * 7
+    assert changed.surfaces_alone == usual.surfaces_alone
+
+
+def test_a_value_for_a_section_names_keys_that_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"did you mean decision\.min_confidence, decision\."):
+        load_config(None, ["decision=3"])
+    with pytest.raises(ConfigError, match=r"did you mean descriptor\.name\?"):
+        load_config(None, ["descriptor=fpfh"])
+    with pytest.raises(ConfigError, match="'seed' = -1: it must be greater than or equal to 0"):
+        load_config(None, ["seed=-1"])
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "expert.scale.reaches",
+        "expert.locating.polishing",
+        "expert.many_poses.reaches",
+        "expert.many_poses.group_reaches",
+    ],
+)
+def test_a_list_of_reaches_is_never_empty(key: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(key)):
+        load_config(None, [f"{key}=[]"])
+    load_config(None, [f"{key}=[2.0]"])
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("descriptor.options={a: 1}", "the descriptor 'fpfh' takes none"),
+        ("matching.options={a: 1}", "the matcher 'one_way' takes none"),
+        ("estimator.options={a: 1}", "the estimator 'consensus' takes none"),
+        ("refinement.options={a: 1}", "the refiner 'gicp' takes none"),
+        ("scoring.options={surfaces: {a: 1}}", "the scorer 'surfaces' takes none"),
+        ("scoring.options={surfcaes: {a: 1}}", "surfcaes.*none of the scorers surfaces, network"),
+        ("scoring.options={network: {weights: x}}", "scoring.weights"),
+    ],
+)
+def test_options_that_nothing_takes_are_refused(setting: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        geomoe3d.Registrar(load_config(None, [setting])).pipeline.warm_up()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import geomoe3d
 from geomoe3d.types import FloatArray
@@ -47,3 +48,14 @@ def test_a_flat_cloud_is_named() -> None:
     result = geomoe3d.register(*flat)
     assert not result.ok
     assert sum("is flat: all its points lie in one plane" in reason for reason in result.reasons) == 2
+
+
+def test_a_straight_line_is_named_once_and_nothing_else_speaks(capfd: pytest.CaptureFixture[str]) -> None:
+    line = geomoe3d.load_points(np.outer(np.linspace(-5, 5, 3000), [1.0, 2.0, 3.0]), name="line")
+    result = geomoe3d.register(line, line)
+    assert result.status == "failed"
+    assert sum("lie on one straight line" in reason for reason in result.reasons) == 1
+    few = np.random.default_rng(0).uniform(0, 5, (7, 3))
+    found = geomoe3d.register(few, np.random.default_rng(1).uniform(0, 5, (4000, 3)), voxel_size=2.0)
+    assert not found.ok
+    assert capfd.readouterr().err == ""  # the library's own warnings on few points

@@ -62,7 +62,7 @@ def test_sample_pair_lands_on_the_truth_and_knows_it(pair, answer):
     assert translation_error(answer.T_target_source, pair[2]) < 0.01
     assert 0.4 < answer.overlap < 0.8
     assert 0 < answer.num_inliers < answer.num_correspondences <= 2000
-    stages = ("load", "prepare", "features", "match", "propose", "score", "refine", "decide", "total")
+    stages = ("load", "preprocess", "features", "match", "propose", "score", "refine", "decide", "total")
     assert tuple(answer.seconds) == stages
     assert np.linalg.det(answer.T_target_source[:3, :3]) == pytest.approx(1, abs=1e-12)
 
@@ -281,7 +281,7 @@ def test_progress_names_every_stage_in_order(pair):
     geomoe3d.register(*pair[:2], progress=stages.append)
     assert list(dict.fromkeys(stages)) == [
         "load",
-        "prepare",
+        "preprocess",
         "features",
         "match",
         "propose",

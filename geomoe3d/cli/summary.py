@@ -97,15 +97,22 @@ def _chosen(result: RegistrationResult) -> str:
 
 def _cloud(cloud: CloudReport) -> str:
     dropped = [
-        f"{count:,} {what}"
-        for count, what in (
-            (cloud.num_non_finite, "non-finite"),
-            (cloud.num_duplicates, "duplicates"),
-            (cloud.num_isolated, "isolated voxels"),
+        f"{count:,} {what if count == 1 else several}"
+        for count, what, several in (
+            (
+                cloud.num_non_finite,
+                "point with NaN or infinite coordinates",
+                "points with NaN or infinite coordinates",
+            ),
+            (cloud.num_duplicates, "duplicate", "duplicates"),
+            (cloud.num_isolated, "isolated voxel", "isolated voxels"),
         )
         if count
     ]
-    text = f"{cloud.name}: {cloud.num_input:,} points in, {cloud.num_points:,} voxel points used"
+    text = f"{cloud.name}: {cloud.num_input:,} points in"
+    if not cloud.num_points:  # given up before any grid was chosen
+        return text
+    text += f", {cloud.num_points:,} voxel points used"
     return text + (f"; dropped {', '.join(dropped)}" if dropped else "; nothing dropped")
 
 

@@ -122,9 +122,8 @@ def check_cloud(cloud: PointCloud) -> None:
         EmptyCloudError: fewer than 3 points, or all points equal.
     """
     if len(cloud) < _MIN_POINTS:
-        raise EmptyCloudError(
-            f"'{cloud.name}' holds {len(cloud)} points; a rigid transform needs at least {_MIN_POINTS}"
-        )
+        held = "1 point" if len(cloud) == 1 else f"{len(cloud)} points"
+        raise EmptyCloudError(f"'{cloud.name}' holds {held}; a rigid transform needs at least {_MIN_POINTS}")
     if not extents(cloud.points).any():
         raise EmptyCloudError(
             f"'{cloud.name}': all {len(cloud)} points are equal to {cloud.file_points[0].tolist()}; "

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import Field
+
 from geomoe3d.config.section import Section, constant
 
 _FIT = "scripts/fit_confidence.py; docs/measurements.md holds what came of it on real scans"
 _REAL_PAIRS = "right answers on real scans"
-Slopes = tuple[float, float, float, float, float, float, float]
+Slope = Annotated[float, Field(ge=-1000, le=1000)]
+Slopes = tuple[Slope, Slope, Slope, Slope, Slope, Slope, Slope]
 
 
 class ConfidenceFit(Section):

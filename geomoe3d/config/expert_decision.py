@@ -122,7 +122,7 @@ class ParallelExpert(Section):
 class ScaleExpert(Section):
     """Whether two clouds are of one size (`decision/scale.py`)."""
 
-    reaches: tuple[Annotated[float, Field(gt=0, le=100)], ...] = constant(
+    reaches: Annotated[tuple[Annotated[float, Field(gt=0, le=100)], ...], Field(min_length=1)] = constant(
         (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5),
         "voxels",
         None,

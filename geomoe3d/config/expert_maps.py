@@ -107,7 +107,7 @@ class LocatingExpert(Section):
     )
     kept: int = constant(12, "candidates", (1, 10_000), "that are different")
     polished: int = constant(8, "candidates", (1, 10_000), "that are drawn closer")
-    polishing: tuple[Annotated[float, Field(ge=0.1, le=100)], ...] = constant(
+    polishing: Annotated[tuple[Annotated[float, Field(ge=0.1, le=100)], ...], Field(min_length=1)] = constant(
         (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0),
         "voxels",
         None,

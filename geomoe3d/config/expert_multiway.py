@@ -188,14 +188,19 @@ class ManyPosesExpert(Section):
     )
     num_points: int = constant(500, "points", (10, 1_000_000), "of each scan, asked about each neighbour")
     least_overlap: float = constant(0.1, "share", (0, 1), "of scans that are laid on each other")
-    reaches: tuple[Annotated[float, Field(ge=0.01, le=1000)], ...] = constant(
+    reaches: Annotated[tuple[Annotated[float, Field(ge=0.01, le=1000)], ...], Field(min_length=1)] = constant(
         (3.0, 3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5),
         "voxels",
         None,
         "within which points are matched, one step each",
     )
-    group_reaches: tuple[Annotated[float, Field(ge=0.01, le=1000)], ...] = constant(
-        (5.0, 4.0, 3.0, 3.0, 2.0, 2.0), "voxels", None, "the same of two groups that are laid on each other"
+    group_reaches: Annotated[tuple[Annotated[float, Field(ge=0.01, le=1000)], ...], Field(min_length=1)] = (
+        constant(
+            (5.0, 4.0, 3.0, 3.0, 2.0, 2.0),
+            "voxels",
+            None,
+            "the same of two groups that are laid on each other",
+        )
     )
     most_pairs: int = constant(30, "pairs", (1, 10_000), "of scans, asked for two groups")
     neighbors_again: int = constant(5, "steps", (0, 1000), "before it is asked again who overlaps whom")

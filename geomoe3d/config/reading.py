@@ -88,7 +88,9 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     import yaml
 
     try:
-        tree = yaml.safe_load(_shipped(Path(path)).read_text(encoding="utf-8"))
+        text = _shipped(Path(path)).read_text(encoding="utf-8")
+        tree = yaml.safe_load(text)
+        twice = _twice(yaml.compose(text, yaml.SafeLoader))
     except FileNotFoundError as error:
         names = [str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml"))]
         close = difflib.get_close_matches(str(path), names, n=1, cutoff=0.75)
@@ -98,11 +100,25 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"'{path}' is not valid YAML: {error}") from None
+    if twice:
+        raise ConfigError(f"'{path}' gives '{twice[0]}' more than once; keep one of them")
     if tree is None:
         return {}
     if not isinstance(tree, dict):
         raise ConfigError(f"'{path}' holds a {type(tree).__name__}, expected a mapping of keys to values")
     return tree
+
+
+def _twice(node: Any, prefix: str = "") -> list[str]:
+    """Keys that stand more than once in one mapping of a YAML document, of which YAML silently takes the last."""
+    found: list[str] = []
+    names: set[str] = set()
+    for key, value in node.value if node is not None and node.id == "mapping" else ():
+        name = f"{prefix}{key.value}"
+        found += [name] if name in names else []
+        names.add(name)
+        found += _twice(value, f"{name}.")
+    return found
 
 
 def _shipped(path: Path) -> Path:
@@ -124,9 +140,12 @@ def _explain(error: ValidationError, section: type[Section]) -> str:
             hint = f"it is now {MOVED[key]}" if key in MOVED else _nearest(key, known_keys(section))
             parts.append(f"unknown key '{key}'; {hint}")
         elif problem["type"] in ("model_type", "model_attributes_type"):
-            parts.append(f"'{key}' is a section, found {problem['input']!r}; did you mean {key}.name?")
+            inside = [name for name in known_keys(section) if name.startswith(f"{key}.")]
+            meant = f"{key}.name" if f"{key}.name" in inside else ", ".join(inside)
+            parts.append(f"'{key}' is a section, found {problem['input']!r}; did you mean {meant}?")
         else:
-            parts.append(f"'{key}' = {problem['input']!r}: {problem['msg']}")
+            said = problem["msg"].removeprefix("Value error, ").replace("Input should be", "it must be")
+            parts.append(f"'{key}' = {problem['input']!r}: {said}")
     return "; ".join(parts)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 BY_HAND = "set by hand, never varied"
 """Source of a constant that nobody has measured."""
@@ -14,6 +14,19 @@ class Section(BaseModel):
     """A node of the configuration tree: frozen, strict about keys, lenient about 1 against 1.0."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_its_own(cls, tree: Any) -> Any:
+        """A key of a section inside this one leaves that section's others as they stand here by default."""
+        if not isinstance(tree, dict):
+            return tree
+        whole = dict(tree)
+        for name, info in cls.model_fields.items():
+            given, default = whole.get(name), info.default
+            if isinstance(given, dict) and isinstance(default, Section):
+                whole[name] = {key: getattr(default, key) for key in type(default).model_fields} | given
+        return whole
 
     def __hash__(self) -> int:
         """Of the values; options of parts are mappings, which have no hash of their own."""

@@ -43,7 +43,10 @@ def made_parallel(
         return T_target_source
     center = contact.points.mean(0)
     radius, covariance = covariance_of(contact, center, source.voxel_size)
-    prior = np.linalg.inv(covariance + 1e-12 * np.trace(covariance) * np.eye(6))
+    spread = float(np.trace(covariance))
+    if not (np.isfinite(spread) and spread > 0):  # surfaces without any gap, such as a plane on itself
+        return T_target_source
+    prior = np.linalg.inv(covariance + 1e-12 * spread * np.eye(6))
     sigma = np.radians(known.sigma_deg)
     # A turn by w takes a direction a to a + w x a.
     J = -np.array([cross_matrix(direction) for direction in ours]) / radius

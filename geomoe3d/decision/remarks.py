@@ -45,9 +45,11 @@ def remarks(
         yield "source and target are the same file"
     if judgement.status == "ok":
         return
-    for cloud in described:
+    for cloud in {cloud.name: cloud for cloud in described}.values():
         spread = np.linalg.svd(cloud.points - cloud.points.mean(0), compute_uv=False)
-        if spread[2] < expert().remarks.flat * spread[0]:
+        if spread[1] < expert().remarks.flat * spread[0]:
+            yield f"all points of '{cloud.name}' lie on one straight line; they fix no turn about it"
+        elif spread[2] < expert().remarks.flat * spread[0]:
             yield (
                 f"'{cloud.name}' is flat: all its points lie in one plane, as those of a 2-D scanner do; this method "
                 "compares surfaces in space, so give scans with height"
@@ -60,8 +62,9 @@ def remarks(
         )
     if not sensors_known and config.viewpoint in ("auto", "guess"):
         yield (
-            "where the sensors stood is not known and was guessed; if they stood at the files' origins, "
-            "preparation.viewpoint=origin says so, and more answers are right"
+            "where the sensors stood is not known and was guessed; more answers are right where it is given: "
+            "--sensor-source X,Y,Z and --sensor-target, or --set preparation.viewpoint=origin if they stood at the "
+            "files' origins"
         )
 
 

@@ -69,7 +69,8 @@ def explain_similarity(
         )
         return Explanation(failed_result(clouds, reason, config, clock.stop()), *clouds)
     found, ratio = best
-    stages = {**found.result.seconds, **clock.stop()}
+    whole = clock.stop()
+    stages = {name: time for name, time in found.result.seconds.items() if name not in whole} | whole
     result = replace(found.result, config=config.model_dump(mode="json"), seconds=stages)
     return as_similarity(found, ratio, clouds[0], result)
 

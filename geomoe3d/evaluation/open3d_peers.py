@@ -125,7 +125,7 @@ def feature_ransac(
 
     registration = o3d.pipelines.registration
     clock = StageClock()
-    clock("prepare")
+    clock("preprocess")
     thinned = [_thinned(points, given.voxel_size) for points in (source, target)]
     if min(len(cloud.points) for cloud in thinned) < 3:
         return Answer(None)

@@ -95,7 +95,7 @@ def kiss_matcher(source: FloatArray, target: FloatArray, given: MethodInput) -> 
         return Answer(None)
     T = make_transform(np.array(answer.rotation), np.array(answer.translation).ravel())
     stages = {
-        "prepare": matcher.get_processing_time(),
+        "preprocess": matcher.get_processing_time(),
         "features": matcher.get_extraction_time(),
         "match": matcher.get_matching_time(),
         "solve": matcher.get_rejection_time() + matcher.get_solver_time(),

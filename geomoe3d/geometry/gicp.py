@@ -73,6 +73,9 @@ def align(
     """
     import small_gicp
 
+    fewest = min(source.cloud.size(), target.cloud.size())
+    if fewest < expert().alignment.least_matched:  # of so few the library warns on its own, again and again
+        return Aligned(None, too_few(fewest))
     answer = small_gicp.align(
         target.cloud,
         source.cloud,

@@ -64,7 +64,7 @@ class Finder:
             count: places that are looked at closely, at most.
             clock: told of the stages.
         """
-        clock("prepare")
+        clock("preprocess")
         rule = self.line.config.preparation.viewpoint
         view = find_viewpoints(cloud, cloud, rule)[0]
         local = [shift_frames(T, -cloud.origin, -self.voxels.origin) for T in guesses]
@@ -113,7 +113,7 @@ class Finder:
 
     def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
         """The search for a scan on a level."""
-        clock("prepare")
+        clock("preprocess")
         bare = prepare(
             cloud, level.voxel_size, self.line.config.preparation, viewpoint=view, seed=self.line.config.seed
         )

@@ -13,6 +13,7 @@ from typing import ClassVar
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import PartConfig, ScoringConfig
+from geomoe3d.errors import ConfigError
 from geomoe3d.parts import Part, Registry
 from geomoe3d.types import FloatArray, Score
 
@@ -65,6 +66,13 @@ def make_scorers(config: ScoringConfig) -> dict[str, Scorer]:
         ConfigError: an unknown name, or settings that a scorer does not take.
         CheckpointError, DependencyError: trained weights or a library are missing.
     """
+    for name in config.options:
+        if name == "network":
+            raise ConfigError("scoring.options.network: its weights are given as scoring.weights")
+        if name not in config.scorers:
+            raise ConfigError(
+                f"scoring.options are given for '{name}', which is none of the scorers {', '.join(config.scorers)}"
+            )
     options = {**config.options, "network": {"weights": config.weights}}
     return {
         name: scorer.make(PartConfig(name=name, options=options.get(name, {}))) for name in config.scorers

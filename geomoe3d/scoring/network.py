@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.config import PartConfig, expert
+from geomoe3d.config import expert
 from geomoe3d.errors import CheckpointError
 from geomoe3d.networks.weight_files import DEFAULT_WEIGHTS, check_weights, judges_transforms
 from geomoe3d.runtime.files import file_hash
@@ -24,8 +24,6 @@ from geomoe3d.scoring.base import PairScorer, Scorer, scorer
 from geomoe3d.types import FilterOutput, FloatArray, Hypothesis, Score
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
-
     from geomoe3d.networks.motion_judge import Judged, MotionJudge
 
 NETWORK = "network"
@@ -67,7 +65,8 @@ class NetworkScorer(Scorer):
     """A network that scores transforms as scorer; loaded when it is first needed.
 
     Args:
-        weights: a .safetensors file with its card, or the name of weights that ship with the package.
+        weights: a .safetensors file with its card, or the name of weights that ship with the package; None takes
+            these.
 
     Raises:
         CheckpointError: not found, damaged, or of another kind of network.
@@ -75,22 +74,14 @@ class NetworkScorer(Scorer):
 
     selective: ClassVar[bool] = True
 
-    def __init__(self, weights: str | Path = DEFAULT_WEIGHTS) -> None:
+    def __init__(self, weights: str | Path | None = None) -> None:
+        weights = weights or DEFAULT_WEIGHTS
         self._path = check_weights(weights)
         if not judges_transforms(self._path):
             raise CheckpointError(
                 f"the network '{weights}' weighs correspondences, it scores no transforms: give its weights as "
                 "filter.weights"
             )
-
-    @classmethod
-    def from_config(cls, config: PartConfig) -> Self:
-        """With the weights that the option ``weights`` names, or those that ship with the package.
-
-        Raises:
-            CheckpointError: not found, or they do not fit.
-        """
-        return cls(config.options.get("weights") or DEFAULT_WEIGHTS)
 
     @cached_property
     def _judge(self) -> MotionJudge:

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from geomoe3d.result import RegistrationResult
 
 _MILLIMETRES = 1000.0
+_LEAST = 1e-3
+"""Fewer millimetres than that no scanner measures."""
 
 
 def length(value: float, unit: str, form: str = ".6g") -> str:
@@ -26,12 +28,13 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
         return [*facts, ("overlap", overlap)]
     near, far = found.sigma_center, found.sigma_farthest
     guess = "" if unit else " if the unit is the metre"
-    metres = f" ({near * _MILLIMETRES:.3g} and {far * _MILLIMETRES:.3g} mm{guess})"
+    small = _MILLIMETRES * near >= _LEAST and far < 1  # else the unit is no metre, or a metre says more
+    metres = f" ({near * _MILLIMETRES:.3g} and {far * _MILLIMETRES:.3g} mm{guess})" if small else ""
     held = "one deviation" if result.ok else "one deviation, if the answer is right"
     return [
         *facts,
         ("overlap", f"{found.overlap_source:.0%} of the source, {found.overlap_target:.0%} of the target"),
-        ("inlier RMSE", length(found.inlier_rmse, unit, ".3g")),
+        ("inlier RMSE", _rmse(found.inlier_rmse, unit)),
         (
             "distance",
             f"mean {found.distance_mean:.3g}, median {found.distance_median:.3g}, standard deviation "
@@ -43,6 +46,10 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
             f"point, {found.sigma_rotation_deg:.2g} deg{metres if unit in ('', 'm') else ''}",
         ),
     ]
+
+
+def _rmse(value: float, unit: str) -> str:
+    return length(value, unit, ".3g") if np.isfinite(value) else "none: no correspondence is an inlier"
 
 
 def _scale(result: RegistrationResult) -> str:
@@ -67,8 +74,9 @@ def paragraph(result: RegistrationResult) -> str:
     if np.isfinite(center).all():
         step = np.linalg.norm(center - transform_points(inverse(T, result.scale), center))
         words += f" and shifted by {step:.3g}"
+    overlap = result.overlap if result.accuracy is None else result.accuracy.overlap_source
     words += (
-        f"; {result.overlap:.0%} of the source lies on the target, {result.num_inliers:,} of "
+        f"; {overlap:.0%} of the source lies on the target, {result.num_inliers:,} of "
         f"{result.num_correspondences:,} correspondences agree within {result.inlier_threshold:.3g}"
     )
     if result.ok and (found := result.accuracy) is not None:

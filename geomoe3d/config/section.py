@@ -25,7 +25,7 @@ class Section(BaseModel):
         for name, info in cls.model_fields.items():
             given, default = whole.get(name), info.default
             if isinstance(given, dict) and isinstance(default, Section):
-                whole[name] = {key: getattr(default, key) for key in type(default).model_fields} | given
+                whole[name] = {key: getattr(default, key) for key in default.model_fields_set} | given
         return whole
 
     def __hash__(self) -> int:

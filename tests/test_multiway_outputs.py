@@ -133,7 +133,7 @@ def test_poses_are_read_as_they_were_written(tmp_path, kind):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3\n", "TUM has 8, KITTI 12"),
+        ("1 2 3\n", "TUM hold 8, all of KITTI 12"),
         ("0 0 0 0 0 0 0 1\n", "1 poses for 2 scans"),
         ('{"a": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "no pose for 'b'"),
         ("[[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]],[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]", "rot"),
@@ -169,3 +169,18 @@ def test_given_poses_place_scans_that_follow_each_other(scanned_room, tmp_path):
     for name in names:
         expected = transform_points(inverse(truth["scan_0"]) @ truth[name], points)
         assert np.abs(transform_points(group.poses[name], points + UTM) - UTM - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"1 2 3\n", "its lines hold 3 numbers; all lines of TUM hold 8, all of KITTI 12"),
+        (b"# nothing\n", "its lines hold no numbers"),
+        (b"\xff\xfe", "it is no text in UTF-8"),
+        (b'{"groups": [{"a": 1}]}', "the key 'scans' is missing"),
+    ],
+)
+def test_poses_that_are_none_are_refused_in_plain_words(tmp_path, content, words):
+    (tmp_path / "poses").write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_poses(tmp_path / "poses", ["a", "b"])

@@ -38,7 +38,11 @@ class _Outputs:
 @click.argument("target", metavar="TARGET")
 @configuration_options
 @scale_option
-@click.option("--weights", metavar="FILE", help="Trained network (.safetensors): scorer or filter, as it is.")
+@click.option(
+    "--weights",
+    metavar="FILE",
+    help="Trained network (.safetensors) that scores transforms or rejects outliers.",
+)
 @click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
 @click.option(
@@ -74,7 +78,10 @@ class _Outputs:
 @click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
 @click.option("--report", metavar="FILE", help="Write one sheet for a customer: .pdf.")
 @click.option(
-    "--unit", metavar="NAME", default="", help="Name of the files' unit of length, such as m, for the eye."
+    "--unit",
+    metavar="NAME",
+    default="",
+    help="Name of the files' unit of length, such as m; shown behind lengths, nothing is converted.",
 )
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
 @click.option("--force", is_flag=True, help="Replace output files that exist.")

@@ -50,13 +50,16 @@ def read_poses(path: str | os.PathLike[str], names: Sequence[str]) -> tuple[Floa
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the initial poses '{path}': {error}") from None
+        why = getattr(error, "strerror", None) or "it is no text in UTF-8"
+        raise InputError(f"cannot read the initial poses '{path}': {why}") from None
     try:
         found = _of_json(json.loads(text), names) if text.lstrip()[:1] in "[{" else _of_text(text)
         if len(found) != len(names):
             raise InputError(f"{len(found)} poses for {len(names)} scans; give one per scan, in their order")
         return tuple(check_motion(T) for T in found)
-    except (GeoMoE3DError, ValueError, TypeError, KeyError) as error:
+    except KeyError as error:
+        raise InputError(f"initial poses '{path}': the key {error} is missing") from None
+    except (GeoMoE3DError, ValueError, TypeError) as error:
         raise InputError(f"initial poses '{path}': {error}") from None
 
 
@@ -76,7 +79,8 @@ def _of_text(text: str) -> list[FloatArray]:
             T[:3, 3], T[:3, :3] = row[1:4], Rotation.from_quat(row[4:]).as_matrix()
             found.append(T)
         return found
-    raise InputError(f"lines of {sorted(lengths)} numbers; TUM has 8, KITTI 12")
+    held = " and ".join(map(str, sorted(lengths))) or "no"
+    raise InputError(f"its lines hold {held} numbers; all lines of TUM hold 8, all of KITTI 12")
 
 
 def _of_json(data: Any, names: Sequence[str]) -> list[FloatArray]:

@@ -64,10 +64,10 @@ _SHOWN = 20
 )
 @click.option(
     "--second-look",
-    type=click.Choice(["between", "all", "none"]),
-    default="between",
+    type=click.Choice(["all", "none"]),
+    default="none",
     metavar="WHICH",
-    help="Doubtful pairs to look at twice: between groups that are apart, all, or none. [between]",
+    help="Doubtful pairs to look at twice, at several times the time: all, or none. [none]",
 )
 @click.option(
     "--optimizer",

@@ -10,8 +10,10 @@ Medioni, 1992, and the weights of Geman and McClure.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,13 @@ class Surface:
         """Of a prepared cloud."""
         return cls(cloud.points, cloud.normals, cloud.viewpoint is not None)
 
+    @cached_property
+    def tree(self) -> Any:
+        """A `scipy.spatial.cKDTree` of the points, built when first asked."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points)
+
 
 @single_blas_thread()
 def align_scans(
@@ -65,24 +74,24 @@ def align_scans(
     Returns:
         The poses; a scan that overlaps no other by its pose stays where it was.
     """
-    from scipy.spatial import cKDTree
-
     scans = sorted(poses)
     most = expert().many_poses.num_points
     chosen = {k: drawn_rows(surfaces[k].points, voxel_size, most, seed) for k in scans}
-    trees = {k: cKDTree(surfaces[k].points) for k in scans}
     centers = {k: surfaces[k].points.mean(0) for k in scans}
     radius = float(np.median([np.sqrt(surfaces[k].points.var(0).sum()) for k in scans]))
     current = {k: np.array(poses[k]) for k in scans}
     pairs: list[tuple[int, int]] = []
+    asked: dict[int, IntArray] = {}
     for number, reach in enumerate(expert().many_poses.reaches):
         if number in (0, expert().many_poses.neighbors_again):
             pairs = _overlapping(current, overlaps)
+            count = Counter(source for source, _ in pairs)
+            asked = {k: _thinned(chosen[k], count[k]) for k in scans}
         about = {k: transform_points(current[k], centers[k][None])[0] for k in scans}
         system = _System(scans, {k: _lever(about[k], radius) for k in scans})
         for source, target in pairs:
             pull = _pull(
-                surfaces[source], surfaces[target], chosen[source], trees[target],
+                surfaces[source], surfaces[target], asked[source],
                 current[source], current[target], reach * voxel_size,
             )  # fmt: skip
             system.add(source, target, *pull)
@@ -109,8 +118,6 @@ def align_groups(
         T_a_b: start, right to about three voxels.
         surfaces, overlaps, voxel_size: as in `align_scans`.
     """
-    from scipy.spatial import cKDTree
-
     shared = [
         (overlaps.of(j, i, inverse(a[i]) @ T_a_b @ b[j]), i, j)
         for i in a
@@ -121,9 +128,10 @@ def align_groups(
     pairs = [
         (i, j) for o, i, j in sorted(shared, reverse=True)[: known.most_pairs] if o >= known.least_overlap
     ]
-    trees = {i: cKDTree(surfaces[i].points) for i in {i for i, _ in pairs}}
-    asked = {j for _, j in pairs}
-    chosen = {j: drawn_rows(surfaces[j].points, voxel_size, known.num_points) for j in asked}
+    count = Counter(j for _, j in pairs)
+    chosen = {
+        j: _thinned(drawn_rows(surfaces[j].points, voxel_size, known.num_points), count[j]) for j in count
+    }
     T = T_a_b
     for reach in known.group_reaches if pairs else ():
         A, slope = np.zeros((6, 6)), np.zeros(6)
@@ -133,8 +141,8 @@ def align_groups(
         lever = _lever(about, 1.0)
         for i, j in pairs:
             one, two = _pull(
-                surfaces[j], surfaces[i], chosen[j], trees[i], T @ b[j], a[i], reach * voxel_size
-            )  # fmt: skip
+                surfaces[j], surfaces[i], chosen[j], T @ b[j], a[i], reach * voxel_size
+            )
             A += lever.T @ one @ lever
             slope += lever.T @ two
         damping = expert().many_poses.damping * float(np.trace(A)) / 6
@@ -186,6 +194,12 @@ class _System:
         return {scan: found[n] for scan, n in self._place.items()}
 
 
+def _thinned(rows: IntArray, neighbors: int) -> IntArray:
+    """Every so many of some rows, so that a scan with many neighbours is asked no more often than others."""
+    most = max(expert().many_poses.points_in_all // max(neighbors, 1), 1)
+    return rows[:: -(-len(rows) // most)] if len(rows) else rows
+
+
 def _overlapping(poses: Mapping[int, FloatArray], overlaps: Overlaps) -> list[tuple[int, int]]:
     """Pairs (source, target), both ways, of scans that see the same by the poses.
 
@@ -205,7 +219,6 @@ def _pull(
     source: Surface,
     target: Surface,
     chosen: IntArray,
-    tree: Any,
     T_source: FloatArray,
     T_target: FloatArray,
     reach: float,
@@ -215,13 +228,12 @@ def _pull(
     Args:
         source, target: the scans.
         chosen: (n,) points of the source that are asked.
-        tree: of the target's points.
         T_source, T_target: poses T_group_scan.
         reach: points farther from the target do not count, cloud units.
     """
     T_target_source = inverse(T_target) @ T_source
     moved = transform_points(T_target_source, source.points[chosen])
-    distance, nearest = tree.query(moved, distance_upper_bound=reach)
+    distance, nearest = target.tree.query(moved, distance_upper_bound=reach)
     hit = np.flatnonzero(np.isfinite(distance))
     nearest = nearest[hit]
     normals = target.normals[nearest]

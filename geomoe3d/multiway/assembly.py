@@ -17,14 +17,12 @@ from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.multiway.alignment import align_groups, align_scans
 from geomoe3d.multiway.cycles import with_cycles
-from geomoe3d.multiway.doubtful import PairKey
 from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
 from geomoe3d.multiway.grouping import Growth, largest_first, reconsidered
-from geomoe3d.multiway.revision import agreement, doubted
 from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.multiway.settling import settle
-from geomoe3d.multiway.survey import Survey, key_of
+from geomoe3d.multiway.survey import PairKey, Survey, key_of
 from geomoe3d.types import FloatArray
 
 
@@ -48,26 +46,6 @@ class Assembly:
         self.edges = self._heard()
         return self._grown(self.edges)
 
-    def revised(self, groups: list[Group]) -> list[Group]:
-        """The last groups, or where they contradict sure edges, others that agree better with all edges.
-
-        Every set of edges that is left out in turn costs as much as making groups once.
-        """
-        own, given = expert().many_groups, (self.edges, self._survey.shapes, self._survey.rules)
-        edges, best = self.edges, -np.inf
-        for _ in range(own.most_revisions):
-            tried = doubted(groups, edges, *given[1:])
-            if not tried:
-                break
-            best = max(best, agreement(groups, *given) + own.revised)
-            made = [self._grown(some) for some in tried]
-            told = [agreement(some, *given) for some in made]
-            first = int(np.argmax(told))
-            if told[first] <= best:
-                break
-            groups, edges, best = made[first], tried[first], told[first]
-        return groups
-
     def _grown(self, edges: list[Edge]) -> list[Group]:
         """Groups by some edges.
 
@@ -78,7 +56,7 @@ class Assembly:
         told = edges, survey.shapes, survey.rules
         groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
         for turn in range(expert().many_groups.most_turns):
-            grown = Growth(groups, *told, self.witness, self.align).run()
+            grown = Growth(groups, *told, self.witness).run()
             if turn and len(grown) == len(groups):
                 break
             placed = [part for group in grown for part in reconsidered(group, *told, self.witness)]
@@ -125,6 +103,9 @@ class Assembly:
         """
         if len(a) * len(b) == 1:
             return T_a_b, 0.0
+        told = told_by(*self._survey.free_space.between(a, b, T_a_b))
+        if told < expert().many_groups.hopeless:
+            return T_a_b, told
         T_a_b = align_groups(
             a, b, T_a_b, self._survey.surfaces, self._survey.overlaps, self._survey.voxel_size
         )

@@ -93,19 +93,33 @@ def propagate(prior: FloatArray, triangles: IntArray, closed: BoolArray) -> Floa
         triangles: (K, 3) numbers of edges.
         closed: (K,) from `closes`.
     """
+    known = expert().many_groups
+    none, one, two, three = known.closing
     messages = np.zeros(triangles.shape)
 
-    known = expert().many_groups
-
     def told() -> FloatArray:
-        sums = np.bincount(triangles.ravel(), known.triangle_share * messages.ravel(), minlength=len(prior))
-        return sums.astype(np.float64)
+        """What each message adds: the strongest in full, every further one less, since scans of one place
+        are deceived alike."""
+        edge, message = triangles.ravel(), messages.ravel()
+        order = np.lexsort((-np.abs(message), edge))
+        before = np.arange(len(order)) - np.searchsorted(edge[order], edge[order])
+        added = np.empty(len(order))
+        added[order] = known.triangle_share**before * message[order]
+        return added.reshape(triangles.shape)
+
+    def summed(added: FloatArray) -> FloatArray:
+        return np.bincount(triangles.ravel(), added.ravel(), minlength=len(prior)).astype(np.float64)
 
     for _ in range(known.rounds):
         # What an edge tells a triangle leaves out what that triangle told it.
-        odds = (prior + told())[triangles] - known.triangle_share * messages
+        added = told()
+        odds = (prior + summed(added))[triangles] - added
         likely = 1 / (1 + np.exp(-np.clip(odds, -known.most_told, known.most_told)))
-        others = (1 - known.missed) * np.roll(likely, -1, axis=1) * np.roll(likely, -2, axis=1)
-        fresh = np.where(closed[:, None], np.log1p(others * (1 / known.by_chance - 1)), np.log1p(-others))
+        q, r = np.roll(likely, -1, axis=1), np.roll(likely, -2, axis=1)
+        both, either, neither = q * r, q * (1 - r) + r * (1 - q), (1 - q) * (1 - r)
+        if_right = none * both + one * either + two * neither
+        if_wrong = one * both + two * either + three * neither
+        closing, open_ = np.log(if_right / if_wrong), np.log((1 - if_right) / (1 - if_wrong))
+        fresh = np.where(closed[:, None], closing, open_)
         messages = known.damping * messages + (1 - known.damping) * fresh
-    return told()
+    return summed(told())

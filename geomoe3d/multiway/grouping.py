@@ -15,7 +15,6 @@ import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
-from geomoe3d.multiway.bending import unbend
 from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.rules import Group, GroupingRules, Poses
@@ -24,8 +23,6 @@ from geomoe3d.types import BoolArray, FloatArray
 Witness = Callable[[Mapping[int, FloatArray], Mapping[int, FloatArray], FloatArray], tuple[FloatArray, float]]
 """Asked of two groups (poses of each) and a motion T_a_b (4, 4): the motion as the surfaces have it, and the
 log-odds by which the scans speak for it (negative: against)."""
-Align = Callable[[Poses], Poses]
-"""Poses to better poses, by the surfaces of the scans."""
 
 
 @dataclass
@@ -38,7 +35,6 @@ class Motion:
         voices: what they bring together.
         worth: that; once ``weighed``, without what the scans contradict.
         weighed: whether the scans have been asked.
-        poses: of all scans of both groups in the frame of a, where joining them unbends them.
     """
 
     T_a_b: FloatArray
@@ -46,7 +42,6 @@ class Motion:
     voices: float
     worth: float
     weighed: bool = False
-    poses: Poses | None = None
 
 
 class Growth:
@@ -58,7 +53,6 @@ class Growth:
         shapes: of all scans.
         rules: thresholds.
         witness: what the scans say of a motion between two groups; None: they are not asked.
-        align: lays scans on each other's surfaces, for groups that are unbent as they join; None: none are.
     """
 
     def __init__(
@@ -68,16 +62,14 @@ class Growth:
         shapes: Sequence[Shape],
         rules: GroupingRules,
         witness: Witness | None = None,
-        align: Align | None = None,
     ) -> None:
         self.groups = {min(group.poses): group for group in groups}
-        self._shapes, self._rules, self._witness, self._align = shapes, rules, witness, align
-        self._unbent: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
+        self._shapes, self._rules, self._witness = shapes, rules, witness
         home = {scan: number for number, group in self.groups.items() for scan in group.poses}
         self._between: dict[tuple[int, int], list[Edge]] = {}
         for edge in edges:
             a, b = home[edge.source], home[edge.target]
-            if a != b and edge.worth > rules.least_worth:
+            if a != b and edge.worth > rules.least_voice:
                 self._between.setdefault((min(a, b), max(a, b)), []).append(edge)
         self._ways: dict[tuple[int, int], list[Motion]] = {}
 
@@ -90,7 +82,9 @@ class Growth:
                 ((lead(ways), (-a, -b)) for (a, b), ways in self._ways.items()), default=(0.0, (0, 0))
             )
             if worth < self._rules.joined_worth:
-                if any(self._unbend(*pair) for pair in self._bent()):
+                likely = self._likely()
+                if likely is not None:
+                    self._weigh(*likely)
                     continue
                 return largest_first(self.groups.values())
             a, b = -pair[0], -pair[1]
@@ -99,11 +93,22 @@ class Growth:
             else:
                 self._weigh(a, b)
 
+    def _likely(self) -> tuple[int, int] | None:
+        """The surest two groups that the scans could join, and have not been asked about."""
+        least = self._rules.joined_worth - expert().many_groups.most_for
+        voices = {
+            (a, b): max((way.voices for way in ways if not way.weighed), default=least)
+            for (a, b), ways in self._ways.items()
+            if self._witness is not None and len(self.groups[a].poses) + len(self.groups[b].poses) > 2
+        }
+        pair = max(voices, key=lambda pair: (voices[pair], -pair[0], -pair[1]), default=None)
+        return pair if pair is not None and voices[pair] > least else None
+
     def rivals(self) -> list[Motion]:
         """Of two groups: the ways to join them, weighed, the best first; none if only one is worth a look."""
         for pair in self._between:
             ways = self._motions(*pair)
-            if len(ways) > 1 and ways[1].worth > expert().many_groups.rival * ways[0].worth:
+            if len(ways) > 1 and ways[1].worth > max(expert().many_groups.rival * ways[0].worth, 0.0):
                 self._ways[pair] = ways
                 self._weigh(*pair)
                 return self._ways[pair]
@@ -119,10 +124,11 @@ class Growth:
         free = np.ones(len(edges), dtype=np.bool_)
         found: list[Motion] = []
         while len(found) < expert().many_groups.most_transforms and free.any():
-            voices = np.where(agreeing & free, worth, 0.0)
+            voices = np.where(agreeing & free, worth, -np.inf)
             surest = voices.max(axis=1)
-            total = surest + self._rules.further_share * (voices.sum(axis=1) - surest)
-            best = int(np.where(free[: len(total)], total, -1.0).argmax())
+            further = np.maximum(voices, 0.0).sum(axis=1) - np.maximum(surest, 0.0)
+            total = surest + self._rules.further_share * further
+            best = int(np.where(free[: len(total)], total, -np.inf).argmax())
             if not free[best]:
                 break
             mine = np.flatnonzero(agreeing[best] & free)
@@ -153,48 +159,6 @@ class Growth:
             way.weighed = True
         self._ways[a, b] = self._merged(self._ways[a, b], b)
 
-    def _bent(self) -> list[tuple[int, int]]:
-        """Pairs of groups that more than one way would join, the surest first, each asked once as they are."""
-        found = []
-        for (a, b), ways in self._ways.items():
-            sizes = [len(self.groups[k].poses) for k in (a, b)]
-            if (
-                self._align
-                and min(sizes) >= expert().many_groups.least_bent
-                and len(ways) > 1
-                and not self._was_unbent(a, b)
-            ):
-                found.append((-sum(way.voices for way in ways), a, b))
-        return [(a, b) for _, a, b in sorted(found)]
-
-    def _was_unbent(self, a: int, b: int) -> bool:
-        return (tuple(self.groups[a].poses), tuple(self.groups[b].poses)) in self._unbent
-
-    def _unbend(self, a: int, b: int) -> bool:
-        """Find one way of those that differ as far as drift explains, if the scans agree with it."""
-        self._unbent.add((tuple(self.groups[a].poses), tuple(self.groups[b].poses)))
-        ways = sorted(self._ways[a, b], key=lambda way: -way.voices)
-        one, other, best = self.groups[a], self.groups[b], ways[0]
-        further = [edge for way in ways[1:] for edge in way.supporters]
-        poses, fitting = unbend(one, other, best.T_a_b, best.supporters, further, self._shapes, self._rules)
-        share, ids = self._rules.further_share, {id(edge) for edge in fitting}
-        voices = best.voices + share * sum(min(e.worth, expert().many_groups.most_worth) for e in fitting)
-        if not fitting or voices < self._rules.joined_worth or self._align is None or self._witness is None:
-            return False
-        joint = [*best.supporters, *fitting]
-        near = [self._around(group.poses, joint) for group in (one, other)]
-        aligned = self._align({k: poses[k] for part in near for k in part})
-        here, there = ({k: aligned[k] for k in part} for part in near)
-        _, told = self._witness(here, there, np.eye(4))
-        if len(aligned) == len(poses):
-            poses = aligned
-        rivals = [way for way in ways[1:] if not ids & {id(edge) for edge in way.supporters}]
-        way = Motion(best.T_a_b, joint, voices, voices + told, weighed=True, poses=poses)
-        if lead([way, *sorted(rivals, key=lambda rival: -rival.worth)]) < self._rules.joined_worth:
-            return False
-        self._ways[a, b] = [way, *rivals]
-        return True
-
     def _around(self, poses: Poses, supporters: Sequence[Edge]) -> Poses:
         """The scans of a group nearest to where some edges end in it: far away, poses have drifted."""
         if len(poses) <= expert().many_groups.asked:
@@ -205,7 +169,7 @@ class Growth:
         return {k: poses[k] for k in sorted(poses, key=lambda k: (away[k], k))[: expert().many_groups.asked]}
 
     def _merged(self, ways: list[Motion], b: int) -> list[Motion]:
-        """The ways, the best first, those that the surfaces drew together as one."""
+        """The ways, the best first; those that surfaces drew together, or that a bend tells apart, as one."""
         merged: list[Motion] = []
         for way in sorted(ways, key=lambda way: -way.worth):
             same = next((one for one in merged if self._alike(one, way, b)), None)
@@ -221,12 +185,14 @@ class Growth:
         ends = [edge.source if edge.source in poses else edge.target for edge in other.supporters]
         there = np.stack([poses[scan] for scan in ends])
         shift, turn = differences(one.T_a_b @ there, other.T_a_b @ there, [self._shapes[k] for k in ends])
-        return bool((shift < self._rules.tolerance).all() and (turn < self._rules.turn_deg).all())
+        bent = expert().many_groups.bent
+        alike = (shift < bent * self._rules.tolerance) & (turn < bent * self._rules.turn_deg)
+        return bool(alike.all())
 
     def _join(self, a: int, b: int) -> None:
         """Group b becomes part of group a; poses are optimised where there are loops to close."""
         way, one, other = self._ways[a, b][0], self.groups[a], self.groups.pop(b)
-        poses = way.poses or {**one.poses, **{scan: way.T_a_b @ T for scan, T in other.poses.items()}}
+        poses = {**one.poses, **{scan: way.T_a_b @ T for scan, T in other.poses.items()}}
         edges = [*one.edges, *other.edges, *way.supporters]
         grown = len(other.poses) > 1 or _octave(len(poses)) > _octave(len(one.poses))
         if grown and len(edges) >= len(poses):

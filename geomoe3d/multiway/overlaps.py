@@ -25,6 +25,10 @@ class Overlaps:
     def __init__(self, points: dict[int, FloatArray], voxel_size: float, *, seed: int = 0) -> None:
         most = expert().many_pairs.overlap_sample
         self._points = {k: p[drawn_rows(p, voxel_size, most, seed)] for k, p in points.items()}
+        self._center = {k: p.mean(0) for k, p in self._points.items()}
+        self._radius = {
+            k: float(np.linalg.norm(p - self._center[k], axis=1).max()) for k, p in self._points.items()
+        }
         self._tree = lru_cache(maxsize=None)(self._build)
 
     def of(self, source: int, target: int, T_target_source: FloatArray) -> float:
@@ -32,6 +36,9 @@ class Overlaps:
         if source not in self._points or target not in self._points:
             return 0.0
         tree, reach = self._tree(target)
+        away = transform_points(T_target_source, self._center[source][None])[0] - self._center[target]
+        if float(np.linalg.norm(away)) > self._radius[source] + self._radius[target] + reach:
+            return 0.0
         moved = transform_points(T_target_source, self._points[source])
         distance, _ = tree.query(moved, distance_upper_bound=reach)
         return float(np.isfinite(distance).mean())

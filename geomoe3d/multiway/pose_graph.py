@@ -17,6 +17,7 @@ from geomoe3d.config import expert
 from geomoe3d.errors import DependencyError
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
 from geomoe3d.multiway.edges import Edge, source_information
+from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.types import FloatArray
 
 Library = Literal["open3d", "gtsam"]
@@ -27,7 +28,6 @@ def optimise(
     edges: Sequence[Edge],
     tolerance: float,
     *,
-    sure: Sequence[Edge] = (),
     library: Library = "open3d",
 ) -> dict[int, FloatArray]:
     """Poses T_group_scan optimised over the edges; the scan with the smallest number stays where it is.
@@ -36,7 +36,6 @@ def optimise(
         poses: (4, 4) by scan, local coordinates.
         edges: between these scans; they connect all of them.
         tolerance: distance at which points count as not matching, cloud units.
-        sure: those of the edges that the line process may not switch off.
         library: that computes it.
 
     Raises:
@@ -46,7 +45,7 @@ def optimise(
     """
     if len(poses) < 2 or len(edges) < len(poses):
         return poses
-    certain = spanning_tree(edges) | {id(edge) for edge in sure}
+    certain = spanning_tree(edges)
     solve = _by_open3d if library == "open3d" else _by_gtsam
     found = solve(poses, edges, certain, tolerance)
     if not np.isfinite(list(found.values())).all():
@@ -61,8 +60,7 @@ def optimise(
 def _by_open3d(
     poses: dict[int, FloatArray], edges: Sequence[Edge], certain: Collection[int], tolerance: float
 ) -> dict[int, FloatArray]:
-    import open3d as o3d
-
+    o3d = open3d_core()
     registration = o3d.pipelines.registration
     scans = sorted(poses)
     number = {scan: k for k, scan in enumerate(scans)}

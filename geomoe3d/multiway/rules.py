@@ -26,7 +26,8 @@ class GroupingRules:
         kept_error: largest `expected_error` of a kept edge, cloud units.
         correlation: real errors of the sensor's place over what independent gaps would give: neighbouring
             points err alike. In four scenes of depth cameras half lay above 14 to 21, a tenth above 26 to 45.
-        least_worth: edges with lower log-odds have no voice.
+        least_worth: edges with lower log-odds are taken for wrong.
+        least_voice: those with lower ones propose no motion between groups, which the scans may speak for.
         joined_worth: log-odds that the winning motion must have left.
         optimizer: the library that fits poses to edges.
         further_share: of the log-odds of all supporters but the surest, since they are not independent.
@@ -42,6 +43,7 @@ class GroupingRules:
     correlation: float = 20.0
     further_share: float = 0.5
     least_worth: float = 0.0
+    least_voice: float = -2.0
     joined_worth: float = 2.0
     optimizer: Library = "open3d"
 

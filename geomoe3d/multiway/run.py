@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.batch.folder import read_identity, remove_batch
+from geomoe3d.batch.folder import read_identity
 from geomoe3d.batch.memory import worker_bytes_of_any
 from geomoe3d.batch.run import Labour, try_out
 from geomoe3d.batch.store import BatchStore
@@ -30,14 +30,12 @@ from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_
 from geomoe3d.multiway.pose_graph import Library, require_gtsam
 from geomoe3d.multiway.report import describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
-from geomoe3d.multiway.survey import Looks, Survey
+from geomoe3d.multiway.survey import Survey
 from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.timing import StageClock
 
 _ONCE = {"descriptor": "none", "grids": (), "max_correspondences": 0}  # no second look
-AGAIN_FOLDER = "again"
-"""In that of the pairs: those that were looked at a second time."""
 
 
 @shows_progress("pairs")
@@ -59,7 +57,7 @@ def register_scans(
     sequence: bool = False,
     initial: str | os.PathLike[str] | None = None,
     initial_error: tuple[float, float] | None = None,
-    second_look: str = "between",
+    second_look: str = "none",
     optimizer: Library = "open3d",
     e57: bool = False,
     progress: Watch = None,
@@ -88,8 +86,8 @@ def register_scans(
         initial: a file with a pose per scan, see `geomoe3d.multiway.initial.read_poses`; implies a sequence.
         initial_error: standard deviation of the motion between two scans that follow each other by these
             poses, cloud units, and of its angle, degrees; None: two voxels and 2 degrees.
-        second_look: which doubtful pairs are looked at a second time, as `geomoe3d.register` does, at several times
-            the time: ``between`` groups that are still apart, the most likely; ``all``; or ``none``.
+        second_look: ``all``: doubtful pairs are looked at a second time, as `geomoe3d.register` does, at several
+            times the time; ``none``.
         optimizer: the library that fits poses to pairs: ``open3d`` or, where it is installed, ``gtsam``.
         e57: write ``groupN.e57`` too: all points of all scans, each scan with its pose.
         progress: called with (pairs done, pairs in all so far proposed); None shows a bar when it takes long, False
@@ -105,8 +103,8 @@ def register_scans(
     """
     if pairs not in ("auto", "all", "similar"):
         raise InputError(f"pairs is '{pairs}'; choose auto, all or similar")
-    if second_look not in ("between", "all", "none"):
-        raise InputError(f"second_look is '{second_look}'; choose between, all or none")
+    if second_look not in ("all", "none"):
+        raise InputError(f"second_look is '{second_look}'; choose all or none")
     if optimizer not in ("open3d", "gtsam"):
         raise InputError(f"optimizer is '{optimizer}'; choose open3d or gtsam")
     if optimizer == "gtsam":
@@ -131,8 +129,7 @@ def register_scans(
     clock("look at the scans")
     given = None if initial is None else read_poses(initial, [scan.name for scan in found])
     config, unusable = _with_voxel_size(resolved(config), stored, found)
-    twice = _changed_look(config, mirror=False)
-    config = twice if second_look == "all" else _changed_look(twice, **_ONCE)
+    config = _changed_look(config, mirror=False, **({} if second_look == "all" else _ONCE))
     poses = None
     if given is not None:
         limits = expert().many_pairs
@@ -142,40 +139,28 @@ def register_scans(
     store = BatchStore(folder / "pairs", config, fresh=fresh)
     if store.begins:
         _try_out(labour, found, Settings.of(config, labour.cache) if fresh else None)
-    again = None
-    if second_look == "between" and twice != config:
-        again = Looks(twice, BatchStore(store.folder / AGAIN_FOLDER, twice, fresh=fresh))
     survey = Survey(
         found, config, store, labour, progress or None, say,
-        sequence=sequence, initial=poses, again=again, optimizer=optimizer,
+        sequence=sequence, initial=poses, optimizer=optimizer,
     )  # fmt: skip
     survey.describe(unusable)
     store.begin()
-    if fresh and again is not None:
-        remove_batch(again.store.folder)
     if fresh:
         remove_model(folder)
     clock("register pairs")
     everything = pairs == "all" or (pairs == "auto" and len(found) <= ALL_PAIRS_UP_TO)
     survey.register(survey.first_pairs(everything, neighbors))
-    survey.look_again(survey.known_second_pairs())
     assembly = Assembly(survey)
     clock("group scans")
     groups = assembly.groups()
     for count in range(rounds):
-        more = survey.further_pairs(groups, neighbors, closing=count == 0)
+        more = survey.further_pairs(groups, neighbors * 2**count, closing=count == 0)
         if not more:
             break
         clock(f"round {count + 1} of at most {rounds}: register {len(more)} further pairs")
         survey.register(more)
         clock("group scans")
         groups = assembly.groups()
-        doubtful = survey.second_pairs(groups)
-        if doubtful:
-            clock(f"round {count + 1}: look again at {len(doubtful)} doubtful pairs between groups")
-            survey.look_again(doubtful)
-            clock("group scans")
-            groups = assembly.groups()
     most = expert().many_pairs.map_rounds
     for count in range(min(rounds, most)):
         maps = survey.map_pairs(groups, assembly.edges)
@@ -187,7 +172,6 @@ def register_scans(
         known, groups = groups, assembly.groups()
         if [group.poses.keys() for group in groups] == [group.poses.keys() for group in known]:
             break
-    groups = assembly.revised(groups)
     clock("write the model")
     model = describe_model(survey, assembly.edges, folder, groups)
     write_model(model, merged_voxel_size, e57=e57)

@@ -6,13 +6,15 @@ it; surfaces do not, so poses are laid on them before edges are judged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from geomoe3d.config import expert
 from geomoe3d.multiway.edges import Edge, Shape, agrees, expected_error, predicted_motion
-from geomoe3d.multiway.grouping import Align
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.rules import Group, GroupingRules, Poses
+
+Align = Callable[[Poses], Poses]
+"""Poses to better poses, by the surfaces of the scans."""
 
 
 def settle(

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.alignment import Surface
-from geomoe3d.multiway.doubtful import PairKey, doubtful_pairs
 from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
 from geomoe3d.multiway.free_space import FreeSpace
 from geomoe3d.multiway.initial import InitialPoses
@@ -37,11 +35,8 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray
 
 
-class Looks(NamedTuple):
-    """One way to look at pairs: how they are registered, and where the answers are kept."""
-
-    config: RegistrationConfig
-    store: BatchStore
+PairKey = tuple[int, int]
+"""Two numbers of scans, the smaller first."""
 
 
 class Survey:
@@ -59,13 +54,10 @@ class Survey:
         say: called with sentences on what begins.
         sequence: whether the scans are given in the order in which they were taken.
         initial: poses of all scans from elsewhere, as of odometry; implies a sequence.
-        again: how doubtful pairs are looked at a second time; None: they are not.
         optimizer: the library that fits poses to edges.
 
     Attributes:
-        scans, config, labour, progress, say, sequence, initial, again: as given.
-        once: how pairs are looked at first.
-        looked_again: pairs that were looked at a second time.
+        scans, config, store, labour, progress, say, sequence, initial: as given.
         voxel_size: edge of the common grid.
         rules: when groups are joined and edges kept.
         unusable: why a scan cannot be registered, by number.
@@ -91,11 +83,9 @@ class Survey:
         *,
         sequence: bool = False,
         initial: InitialPoses | None = None,
-        again: Looks | None = None,
         optimizer: Library = "open3d",
     ) -> None:
-        self.scans, self.config, self.labour = scans, config, labour
-        self.once, self.again = Looks(config, store), again
+        self.scans, self.config, self.store, self.labour = scans, config, store, labour
         self.progress, self.say = progress, say
         self.sequence, self.initial = sequence or initial is not None, initial
         self.voxel_size = float(config.voxel_size or 0.0)
@@ -110,7 +100,6 @@ class Survey:
         self.outcomes: dict[PairKey, Outcome] = {}
         self.edges: dict[PairKey, Edge] = {}
         self.map_edges: dict[str, Edge] = {}
-        self.looked_again: set[PairKey] = set()
 
     # ---- the scans by themselves
 
@@ -168,7 +157,7 @@ class Survey:
             neighbors: otherwise so many per scan, but none between scans that have pairs already.
         """
         usable = self.usable()
-        known = self._known(self.once)
+        known = self._known()
         settled = {scan for pair in known for scan in pair}
         if self.sequence:
             known |= {key_of(i, j) for i, j in pairwise(usable) if j == i + 1}
@@ -227,33 +216,11 @@ class Survey:
         usable = [group for group in groups if set(group.poses) <= self.surfaces.keys()]
         return map_pairs(usable, edges, self.similarity, self.overlaps, sequence=self.sequence)
 
-    def second_pairs(self, groups: list[Group]) -> list[PairKey]:
-        """Pairs between groups that are worth a second look and have not had it.
-
-        Args:
-            groups: as they stand, the largest first.
-        """
-        if self.again is None:
-            return []
-
-        def confidence(pair: PairKey) -> float | None:
-            outcome = self.outcomes.get(pair)
-            if pair in self.looked_again or (outcome is not None and outcome.status == "ok"):
-                return None
-            return 0.0 if outcome is None else outcome.confidence
-
-        usable = self.usable()
-        return doubtful_pairs(groups, usable, self.similarity, confidence, sequence=self.sequence)
-
-    def known_second_pairs(self) -> list[PairKey]:
-        """Pairs that an earlier call looked at a second time."""
-        return [] if self.again is None else sorted(self._known(self.again))
-
-    def _known(self, looks: Looks) -> set[PairKey]:
-        """Pairs in a journal whose scans and files are the same today."""
+    def _known(self) -> set[PairKey]:
+        """Pairs in the journal whose scans and files are the same today."""
         number = {self._row((i, j)).id: (i, j) for j in self.usable() for i in self.usable() if i < j}
         known = set()
-        for record in read_journal(looks.store.folder / JOURNAL_FILE):
+        for record in read_journal(self.store.folder / JOURNAL_FILE):
             pair = number.get(str(record.get("id")))
             if pair is not None and record.get("fingerprint") == self._row(pair).fingerprint():
                 known.add(pair)
@@ -284,39 +251,28 @@ class Survey:
 
     def register(self, pairs: list[PairKey]) -> None:
         """Register what is missing of the pairs."""
-        self._take(self.once, {pair: self._row(pair) for pair in pairs if pair not in self.outcomes})
-
-    def look_again(self, pairs: list[PairKey]) -> None:
-        """Register pairs with a second look, whose answers take the place of the first."""
-        if self.again is not None:
-            self._take(self.again, {pair: self._row(pair) for pair in pairs})
-            self.looked_again |= set(pairs)
-
-    def _take(self, looks: Looks, rows: dict[PairKey, PairRow]) -> None:
-        """Outcomes and edges of pairs, registered where that is missing."""
-        outcomes = self._registered(looks, rows.values())
+        rows = {pair: self._row(pair) for pair in pairs if pair not in self.outcomes}
+        outcomes = self._registered(rows.values())
         for pair, row in rows.items():
             self.outcomes[pair] = outcomes[row.id]
             edge = edge_of(outcomes[row.id], *self._ends(pair), self.shapes)
-            if edge is None:
-                self.edges.pop(pair, None)
-            else:
+            if edge is not None:
                 self.edges[pair] = edge
 
-    def _registered(self, looks: Looks, rows: Iterable[PairRow]) -> dict[str, Outcome]:
+    def _registered(self, rows: Iterable[PairRow]) -> dict[str, Outcome]:
         """Outcomes by the id of the row."""
         unique = {row.id: row for row in rows}
         if not unique:
             return {}
         records, _ = work(
             list(unique.values()),
-            looks.store,
-            looks.config,
+            self.store,
+            self.config,
             self.labour,
             progress=self._count() or False,
             say=self.say,
         )
-        return {name: looks.store.outcome(records[name]) for name in unique}
+        return {name: self.store.outcome(records[name]) for name in unique}
 
     def _count(self) -> Callable[[int, int], None] | None:
         """Progress of one round, told as that of all pairs so far proposed."""
@@ -334,7 +290,7 @@ class Survey:
             source, target = (
                 str(
                     write_map(
-                        self.once.store.folder / MAPS_FOLDER,
+                        self.store.folder / MAPS_FOLDER,
                         members,
                         home[members[0]],
                         self.surfaces,
@@ -344,7 +300,7 @@ class Survey:
                 for members in pair.members
             )
             rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
-        outcomes = self._registered(self.once, rows.values())
+        outcomes = self._registered(rows.values())
         for number, row in rows.items():
             pair = pairs[number]
             edge = edge_of(outcomes[row.id], pair.source, pair.target, frames)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.geometry.se3 import inverse, make_transform
 from geomoe3d.multiway.cycles import closes, find_triangles, propagate, with_cycles
-from geomoe3d.multiway.edges import Shape
 from geomoe3d.multiway.grouping import Growth, reconsidered
 from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import connected_parts, is_kept, settle

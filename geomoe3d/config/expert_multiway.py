@@ -80,7 +80,7 @@ class ManyGroupsExpert(Section):
     )
     most_log_odds: float = constant(7.0, "log-odds", (0, 100), "of an edge by its confidence")
     unrelated: float = constant(
-        2.0, "log-odds", (-100, 100), "taken off: the confidence is that of pairs of which most overlap"
+        1.5, "log-odds", (-100, 100), "taken off: the confidence is that of pairs of which most overlap"
     )
     least_observability: float = constant(
         0.001, "share", (0, 1), "of the strongest direction that weaker ones are held by"

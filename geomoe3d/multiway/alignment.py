@@ -140,9 +140,7 @@ def align_groups(
         )
         lever = _lever(about, 1.0)
         for i, j in pairs:
-            one, two = _pull(
-                surfaces[j], surfaces[i], chosen[j], T @ b[j], a[i], reach * voxel_size
-            )
+            one, two = _pull(surfaces[j], surfaces[i], chosen[j], T @ b[j], a[i], reach * voxel_size)
             A += lever.T @ one @ lever
             slope += lever.T @ two
         damping = expert().many_poses.damping * float(np.trace(A)) / 6

@@ -10,14 +10,17 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.config import expert
 from geomoe3d.errors import GeoMoE3DError, InputError
-from geomoe3d.geometry.se3 import check_motion
+from geomoe3d.geometry.se3 import check_motion, inverse, shift_frames
+from geomoe3d.multiway.edges import Edge, Shape
 from geomoe3d.types import FloatArray
 
 
@@ -34,6 +37,24 @@ class InitialPoses:
     poses: tuple[FloatArray, ...]
     shift: float
     turn_deg: float
+
+    def edges(self, scans: Sequence[int], shapes: Sequence[Shape]) -> list[Edge]:
+        """Edges between scans taken one after the other, as the poses have them.
+
+        Args:
+            scans: numbers of those that can be registered, rising.
+            shapes: of all scans.
+        """
+        known = expert().many_pairs
+        sigma = [np.radians(self.turn_deg)] * 3 + [self.shift] * 3
+        information = np.diag(1 / np.square(sigma))
+        information *= known.odometry_points / float(np.trace(information[3:, 3:]))
+        found = []
+        for i, j in pairwise(scans):
+            T = inverse(self.poses[i]) @ self.poses[j]
+            local = shift_frames(T, -shapes[j].origin, -shapes[i].origin)
+            found.append(Edge(j, i, local, known.odometry_confidence, information, self.shift))
+        return found
 
 
 def read_poses(path: str | os.PathLike[str], names: Sequence[str]) -> tuple[FloatArray, ...]:

@@ -34,7 +34,6 @@ from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import Float32Array, FloatArray
 
-
 PairKey = tuple[int, int]
 """Two numbers of scans, the smaller first."""
 
@@ -265,13 +264,9 @@ class Survey:
         if not unique:
             return {}
         records, _ = work(
-            list(unique.values()),
-            self.store,
-            self.config,
-            self.labour,
-            progress=self._count() or False,
-            say=self.say,
-        )
+            list(unique.values()), self.store, self.config, self.labour,
+            progress=self._count() or False, say=self.say,
+        )  # fmt: skip
         return {name: self.store.outcome(records[name]) for name in unique}
 
     def _count(self) -> Callable[[int, int], None] | None:
@@ -284,44 +279,23 @@ class Survey:
     def register_maps(self, pairs: list[MapPair], groups: list[Group]) -> None:
         """Register pairs of local maps; what they give are further edges between their anchors."""
         home = {scan: group.poses for group in groups for scan in group.poses}
-        rows: dict[int, PairRow] = {}
         frames = {k: replace(shape, origin=-self._stand(k)) for k, shape in enumerate(self.shapes)}
-        for number, pair in enumerate(pairs):
+        folder, rows = self.store.folder / MAPS_FOLDER, []
+        for pair in pairs:
             source, target = (
-                str(
-                    write_map(
-                        self.store.folder / MAPS_FOLDER,
-                        members,
-                        home[members[0]],
-                        self.surfaces,
-                        self._stand(members[0]),
-                    ).resolve()
-                )
-                for members in pair.members
+                str(write_map(folder, some, home[some[0]], self.surfaces, self._stand(some[0])).resolve())
+                for some in pair.members
             )
-            rows[number] = PairRow(json.dumps([source, target], ensure_ascii=False), source, target)
-        outcomes = self._registered(rows.values())
-        for number, row in rows.items():
-            pair = pairs[number]
+            rows.append(PairRow(json.dumps([source, target], ensure_ascii=False), source, target))
+        outcomes = self._registered(rows)
+        for pair, row in zip(pairs, rows, strict=True):
             edge = edge_of(outcomes[row.id], pair.source, pair.target, frames)
             if edge is not None:
                 self.map_edges[row.id] = replace(edge, of_maps=True)
 
     def odometry(self) -> list[Edge]:
         """Edges between scans taken one after the other, as the given poses have them; none without such."""
-        if self.initial is None:
-            return []
-        found = []
-        sigma = [np.radians(self.initial.turn_deg)] * 3 + [self.initial.shift] * 3
-        information = np.diag(1 / np.square(sigma))
-        information *= expert().many_pairs.odometry_points / float(np.trace(information[3:, 3:]))
-        for i, j in pairwise(self.usable()):
-            T = inverse(self.initial.poses[i]) @ self.initial.poses[j]
-            local = shift_frames(T, -self.shapes[j].origin, -self.shapes[i].origin)
-            found.append(
-                Edge(j, i, local, expert().many_pairs.odometry_confidence, information, self.initial.shift)
-            )
-        return found
+        return [] if self.initial is None else self.initial.edges(self.usable(), self.shapes)
 
     def _stand(self, scan: int) -> FloatArray:
         """(3,) where the sensor of a scan stood, or zero where that is not known; local coordinates."""

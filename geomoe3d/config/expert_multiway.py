@@ -64,7 +64,7 @@ class ManyGroupsExpert(Section):
         "share",
         None,
         "of triangles that close though none, one, two or three of their edges are wrong",
-        "two that are wrong alike close: 7 to 21 % in four scenes; what one leaves open is mostly a near miss",
+        "of edges surer than 0.2 in four scenes with two wrong ones 7 to 21 %; with one wrong mostly near misses",
     )
     triangle_share: float = constant(
         0.5, "-", (0, 1), "of what each further triangle says: scans of one place are deceived alike"

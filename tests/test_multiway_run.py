@@ -398,12 +398,12 @@ def test_a_folder_of_other_scans_is_refused_and_one_of_notes_is_not(scanned_room
 
 def test_why_a_scan_is_not_placed_names_its_likely_pairs():
     scans = [Scan(name, f"/{name}.ply") for name in "abc"]
-    edges = [Edge(2, k, np.eye(4), confidence, np.eye(6)) for k, confidence in ((0, 0.9), (1, 0.8))]
+    edges = [Edge(2, k, np.eye(4), confidence, np.eye(6)) for k, confidence in ((0, 0.95), (1, 0.9))]
     survey = SimpleNamespace(
         unusable={}, outcomes=[(0, 2), (1, 2)], scans=scans, rules=GroupingRules(1.0, 1.0, 1.0, 1.0)
     )
     reason = _why_unplaced(survey, edges, 2)
-    assert reason.startswith("its surest of 2 pairs, with 'a', has confidence 0.900")
+    assert reason.startswith("its surest of 2 pairs, with 'a', has confidence 0.950")
     assert "its 2 likely pairs do not agree" in reason
     assert "nothing agrees with it" in _why_unplaced(survey, edges[:1], 2)
 

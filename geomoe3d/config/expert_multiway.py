@@ -82,6 +82,12 @@ class ManyGroupsExpert(Section):
     unrelated: float = constant(
         1.5, "log-odds", (-100, 100), "taken off: the confidence is that of pairs of which most overlap"
     )
+    most_doubted: float = constant(
+        0.5,
+        "probability",
+        (0, 1),
+        "most confidence of a doubted answer: of 95 among many scans 29 were right",
+    )
     least_observability: float = constant(
         0.001, "share", (0, 1), "of the strongest direction that weaker ones are held by"
     )

@@ -129,7 +129,7 @@ def register_scans(
     clock("look at the scans")
     given = None if initial is None else read_poses(initial, [scan.name for scan in found])
     config, unusable = _with_voxel_size(resolved(config), stored, found)
-    config = _changed_look(config, mirror=False, **({} if second_look == "all" else _ONCE))
+    config = _of_many(config, second_look)
     poses = None
     if given is not None:
         limits = expert().many_pairs
@@ -207,10 +207,14 @@ def _with_voxel_size(
     return build_config(RegistrationConfig, tree), unusable
 
 
-def _changed_look(config: RegistrationConfig, **changed: Any) -> RegistrationConfig:
-    """The configuration with other settings of the second look."""
-    look = {**config.second_look.model_dump(), **changed}
-    return build_config(RegistrationConfig, {**config.model_dump(), "second_look": look})
+def _of_many(config: RegistrationConfig, second_look: str) -> RegistrationConfig:
+    """The configuration of the pairs: most of many scans share nothing, so that a doubted answer is worth less."""
+    tree = config.model_dump()
+    tree["second_look"] |= {"mirror": False, **({} if second_look == "all" else _ONCE)}
+    for part in ("confidence", "causes"):
+        given = tree["expert"][part]
+        given["most_doubted"] = min(given["most_doubted"], config.expert.many_groups.most_doubted)
+    return build_config(RegistrationConfig, tree)
 
 
 def _stored_voxel_size(folder: Path) -> float | None:

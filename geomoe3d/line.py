@@ -197,8 +197,10 @@ class Line:
         pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
         weighed, proposed = line.propose(pair, clock)
 
-        def select(pair: Pair, proposed: list[Hypothesis], config: RegistrationConfig) -> Selection:
-            selection = Selection(pair, line.scorers, line.refiner, config, clock)
+        def select(pair: Pair, proposed: list[Hypothesis], again: bool = False) -> Selection:
+            config = stricter if again else self.config
+            choosing = line.second_scorers if again else {}
+            selection = Selection(pair, line.scorers, line.refiner, config, clock, choosing)
             selection.add(proposed)
             if rivals is not None:
                 selection.add(rivals.transforms())
@@ -210,13 +212,13 @@ class Line:
         decide = self.config.decision.model_copy(update={"min_confidence": least})
         stricter = self.config.model_copy(update={"decision": decide})
         with single_blas_thread():
-            selection, looks = select(pair, proposed, self.config), [pair]
+            selection, looks = select(pair, proposed), [pair]
             decision = selection.decide()
             if given is None and sides == "sensor" and self._is_described_again(decision.judgement):
                 again, pair = line.described_again(pair, places, clock)
                 looks.append(again)
                 proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
-                weighed, selection = line.weigh(pair), select(pair, proposed, stricter)
+                weighed, selection = line.weigh(pair), select(pair, proposed, again=True)
                 decision = selection.decide(look.num_refined, look.num_judged)
             if self._is_doubtful(decision.judgement):
                 if given is None:
@@ -224,7 +226,7 @@ class Line:
                     if len(looks) > 1:
                         pair = line.together([*more, looks[0], looks[1]], places)
                         proposed = [h.anew() for h in proposed]
-                        weighed, selection = line.weigh(pair), select(pair, proposed, stricter)
+                        weighed, selection = line.weigh(pair), select(pair, proposed, again=True)
                     coarser = line.coarser_pairs(prepared, places, clock, sides, len(looks) > 1)
                     for further in chain(more, coarser):
                         selection.add(line.propose(further, clock)[1])

@@ -13,6 +13,7 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import (
     DescriptorConfig,
+    PartConfig,
     PreparationConfig,
     RegistrationConfig,
     ScoringConfig,
@@ -66,6 +67,7 @@ class Pipeline:
         second_descriptor: what describes the clouds of a doubtful answer once more, or None.
         filter: outlier rejection, or None without any.
         scorers: by name, in the order in which they are asked.
+        second_scorers: those that are asked about refined hypotheses of clouds that were described again.
 
     Raises:
         ConfigError: an unknown part, or settings that it does not take.
@@ -83,6 +85,7 @@ class Pipeline:
         self.filter: OutlierFilter | None = outlier_filter.make(config.filter) if wanted else None
         self.estimator: Estimator = estimator.make(config.estimator)
         self.scorers: dict[str, Scorer] = make_scorers(config.scoring)
+        self.second_scorers = _second_scorers(config)
         self.refiner: Refiner = refiner.make(config.refinement)
 
     def prepare(
@@ -256,7 +259,7 @@ class Pipeline:
     def _parts(self) -> dict[str, Part]:
         one = {"descriptor": self.descriptor, "matcher": self.matcher, "filter": self.filter}
         one["second descriptor"] = self.second_descriptor
-        rest = {"estimator": self.estimator, **self.scorers, "refiner": self.refiner}
+        rest = {"estimator": self.estimator, **self.scorers, **self.second_scorers, "refiner": self.refiner}
         return {kind: part for kind, part in {**one, **rest}.items() if part is not None}
 
 
@@ -303,6 +306,14 @@ def with_weights(config: RegistrationConfig, name_or_path: str) -> RegistrationC
 def _second_descriptor(config: RegistrationConfig) -> Descriptor | None:
     first, name = config.descriptor, config.second_look.descriptor
     return None if name in ("none", first.name) else descriptor.make(DescriptorConfig(name=name))
+
+
+def _second_scorers(config: RegistrationConfig) -> dict[str, Scorer]:
+    if "network" not in config.scoring.scorers or _second_descriptor(config) is None:
+        return {}  # who leaves one network out wants no other
+    options = config.scoring.options
+    names = config.second_look.scorers
+    return {name: scorer.make(PartConfig(name=name, options=options.get(name, {}))) for name in names}
 
 
 def _check_weights_are_wanted(config: RegistrationConfig) -> None:

@@ -222,6 +222,7 @@ class Hypothesis:
             what is assumed of the others.
         asked: names of the scorers that were really asked about it.
         refined: the same hypothesis after refinement, once it was refined; itself an hypothesis.
+        is_refined: whether it came out of a refinement and needs no other.
         note: what went wrong in the refinement that led to it, or None.
         settled: whether its estimator saw so many correspondences agree with it, and so many more than with any
             different transform, that it needs no costly scorer.
@@ -233,6 +234,7 @@ class Hypothesis:
     scores: dict[str, Score] = field(default_factory=dict)
     asked: set[str] = field(default_factory=set)
     refined: Hypothesis | None = None
+    is_refined: bool = False
     note: str | None = None
     settled: bool = False
 

@@ -45,7 +45,8 @@ KINDS = {
     ),
     "of a trained network, whose weights hold with them alone, or of a published architecture": (
         "networks/*:* features/learned.py:* features/pyramid.py:* training/descriptor_network.py:* images/network.py:*",
-        "maps/level.py:SPACING",
+        "maps/level.py:SPACING scoring/surface_channels.py:* scoring/surface_network.py:*",
+        "training/surface_network.py:*",
     ),
     "of the protocol of a benchmark or of a measurement": (
         "evaluation/*:*",

@@ -163,6 +163,7 @@ def test_the_identity_of_a_pipeline_holds_every_part_and_follows_its_settings() 
 
     plain = of()
     parts = {"descriptor", "second descriptor", "matcher", "estimator", "surfaces", "network", "refiner"}
+    parts.add("surface_network")  # of the second look
     assert set(plain["parts"]) == parts
     assert json.loads(json.dumps(plain)) == plain
     assert {"numpy", "scipy", "torch", "small_gicp"} <= set(plain["versions"])

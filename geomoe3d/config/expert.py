@@ -36,7 +36,12 @@ from geomoe3d.config.expert_proposing import (
     RansacExpert,
     SurroundingsExpert,
 )
-from geomoe3d.config.expert_scoring import AlignmentExpert, NetworkExpert, SurfacesExpert
+from geomoe3d.config.expert_scoring import (
+    AlignmentExpert,
+    NetworkExpert,
+    SurfaceNetworkExpert,
+    SurfacesExpert,
+)
 from geomoe3d.config.section import Section
 
 P = ParamSpec("P")
@@ -63,6 +68,7 @@ class ExpertConfig(Section):
     ransac: RansacExpert = RansacExpert()
     surfaces: SurfacesExpert = SurfacesExpert()
     network: NetworkExpert = NetworkExpert()
+    surface_network: SurfaceNetworkExpert = SurfaceNetworkExpert()
     alignment: AlignmentExpert = AlignmentExpert()
     maps: MapsExpert = MapsExpert()
     places: PlacesExpert = PlacesExpert()

@@ -39,6 +39,15 @@ class NetworkExpert(Section):
     )
 
 
+class SurfaceNetworkExpert(Section):
+    """What the verdict of the surface network counts (`scoring/surface_network.py`)."""
+
+    weight: float = constant(
+        0.5, "per logit", (0, 100), "of the verdict in the logarithm of the score", "docs/training.md"
+    )
+    most: float = constant(12.0, "logit", (0, 100), "beyond which a verdict counts no more, for and against")
+
+
 class AlignmentExpert(Section):
     """Local alignment by GICP or ICP (`geometry/gicp.py`, `refinement/icp.py`)."""
 

@@ -136,6 +136,12 @@ class SecondLookConfig(Section):
         description="an answer found with that descriptor is ok from this confidence on, which was fitted for the "
         "first one; decision.min_confidence counts where it is higher",
     )
+    scorers: tuple[str, ...] = Field(
+        ("surface_network",),
+        description="who helps to choose among the refined hypotheses of clouds that were described again: "
+        "surface_network, a network that looks at the points of both clouds with the features of learned; classes of "
+        "your own",
+    )
     grids: tuple[float, ...] = Field(
         (1.5, 2.0),
         description="coarser grids, in voxels, on which further hypotheses are sought when the first answer "
@@ -151,10 +157,10 @@ class SecondLookConfig(Section):
         0.8, ge=0, le=1, description="an answer that is not ok is doubtful below this confidence"
     )
     num_refined: int = Field(
-        8, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
+        16, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
     )
     num_judged: int = Field(
-        8,
+        16,
         ge=1,
         description="so many of the best distinct hypotheses are shown to the network, if there is one",
     )

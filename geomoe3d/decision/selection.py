@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,6 +42,8 @@ class Selection:
         refiner: polishes the best hypotheses.
         config: of the registration.
         clock: told of the stages score, refine and decide.
+        choosing: scorers that are asked about refined candidates alone. They help to choose the answer; its score, lead
+            and confidence know nothing of them.
     """
 
     def __init__(
@@ -50,10 +53,11 @@ class Selection:
         refiner: Refiner,
         config: RegistrationConfig,
         clock: StageClock,
+        choosing: Mapping[str, Scorer] = MappingProxyType({}),
     ) -> None:
         clock("score")
         self._pair, self._scorers, self._config, self._clock = pair, scorers, config, clock
-        self._source = pair.clouds[0]
+        self._source, self._choosing = pair.clouds[0], choosing
         surfaces = scorers.get(SURFACES, SurfaceScorer())
         self._bound: dict[str, PairScorer] = {SURFACES: surfaces.about(pair)}
         self._refiner = refiner.about(pair)
@@ -85,10 +89,13 @@ class Selection:
         """The best of all hypotheses so far, and how sure.
 
         Args:
-            num_refined: so many of the best distinct hypotheses are refined before the choice.
+            num_refined: so many of the best distinct hypotheses are refined before the choice; where there are
+                several, before costly scorers are asked.
             num_shown: so many that the clouds like best are shown to scorers that are selective.
         """
         selective = [name for name, scorer in self._scorers.items() if scorer.selective]
+        if num_refined > 1:
+            self._refine_best(num_refined)
         if selective:
             self._clock("score")
             for name in selective:
@@ -173,13 +180,33 @@ class Selection:
             return self._refine(self._first)
         asked = [h for h in self.hypotheses if all(name in h.asked for name in selective)]
         best = distinct(asked or self.hypotheses, self._source, self._shift, num_refined)
-        return max((self._refine(h) for h in best), key=lambda refined: refined.score)
+        candidates = [self._refine(h) for h in best]
+        values = np.array([candidate.score for candidate in candidates])
+        transforms = np.array([candidate.T_target_source for candidate in candidates])
+        for scorer in self._choosing.values():
+            said = scorer.about(self._pair)(transforms)
+            if len(said) == len(candidates):  # else it says nothing of this pair
+                values *= [score.factor for score in said]
+        return candidates[int(values.argmax())]
+
+    def _refine_best(self, count: int) -> None:
+        """Refine the ``count`` best distinct hypotheses by the clouds, and add what comes of them: costly scorers are
+        then asked about finished transforms. Many right ones are proposed too far off to be liked as they are."""
+        self._clock("refine")
+        by_clouds = sorted(self.hypotheses, key=lambda h: -evidence_of(h).surface_score)
+        for hypothesis in distinct(by_clouds, self._source, self._shift, count):
+            if not hypothesis.is_refined and hypothesis.refined is None:
+                hypothesis.refined = replace(self._refined(hypothesis), is_refined=True)
+                self.hypotheses.append(hypothesis.refined)
+        self._rank()
 
     def _refine(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis refined and scored, or as it was where that made the clouds fit less well.
 
         A scorer that was asked about it is asked about the refined one; else what was assumed holds.
         """
+        if hypothesis.is_refined:
+            return hypothesis
         if hypothesis.refined is None:  # a second look often likes what the first one did
             hypothesis.refined = self._refined(hypothesis)
         refined = hypothesis.refined

@@ -160,7 +160,9 @@ def test_a_network_is_shown_a_few_distinct_motions_once(pair):
     assert sum(m.tobytes() in given for m in shown) == 2
     findings = asked.decide(3, 4)
     assert len(shown) == 5
-    assert not any(m.tobytes() in given for m in shown[3:])  # where several are refined, they are refined first
+    assert not any(
+        m.tobytes() in given for m in shown[3:]
+    )  # where several are refined, they are refined first
     assert len({m.tobytes() for m in shown}) == len(shown)
     assert rotation_error_deg(findings.T_target_source, pair[1]) < 1
 

@@ -85,7 +85,7 @@ class Pipeline:
         self.filter: OutlierFilter | None = outlier_filter.make(config.filter) if wanted else None
         self.estimator: Estimator = estimator.make(config.estimator)
         self.scorers: dict[str, Scorer] = make_scorers(config.scoring)
-        self.second_scorers = _second_scorers(config)
+        self.second_scorers = _second_scorers(config, self.second_descriptor)
         self.refiner: Refiner = refiner.make(config.refinement)
 
     def prepare(
@@ -308,8 +308,8 @@ def _second_descriptor(config: RegistrationConfig) -> Descriptor | None:
     return None if name in ("none", first.name) else descriptor.make(DescriptorConfig(name=name))
 
 
-def _second_scorers(config: RegistrationConfig) -> dict[str, Scorer]:
-    if "network" not in config.scoring.scorers or _second_descriptor(config) is None:
+def _second_scorers(config: RegistrationConfig, descriptor: Descriptor | None) -> dict[str, Scorer]:
+    if "network" not in config.scoring.scorers or descriptor is None:
         return {}  # who leaves one network out wants no other
     options = config.scoring.options
     names = config.second_look.scorers

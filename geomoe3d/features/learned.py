@@ -14,17 +14,16 @@ About twice the time of FPFH; memory of a few MB for each thread besides 300 num
 from __future__ import annotations
 
 import hashlib
-from functools import cache
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from geomoe3d.config import expert
-from geomoe3d.errors import CheckpointError
 from geomoe3d.features.base import Descriptor, descriptor
 from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.features.pyramid import FACTORS, Level, nearest, pyramid, relations
+from geomoe3d.runtime.tensors import read_tensors
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Float32Array, IntArray, PreparedCloud
 
@@ -147,23 +146,10 @@ class _Network:
         return y if bias is None else y + bias
 
 
-@cache
 def load_tensors(path: Path) -> dict[str, Float32Array]:
     """The tensors of a weight file by name, float32.
 
     Raises:
-        CheckpointError: no such file, or it is none of this descriptor's.
+        CheckpointError: no such file, or it is none of this network's.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
-    try:
-        found = load_file(path)
-    except FileNotFoundError:
-        raise CheckpointError(f"no weights of a descriptor at '{path}'") from None
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"weights of a descriptor '{path}' cannot be read: {error}") from None
-    shape = found["head.2.weight"].shape if "head.2.weight" in found else None
-    if shape is None or shape[0] != LEARNED:
-        raise CheckpointError(f"'{path}' holds no weights of the learned descriptor")
-    return {name: tensor.astype(np.float32) for name, tensor in found.items()}
+    return read_tensors(path, "the learned descriptor", "head.2.weight", (LEARNED, None))

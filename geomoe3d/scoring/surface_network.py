@@ -7,9 +7,7 @@ most telling one hold, three linear layers: in numpy, without torch; `geomoe3d.t
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +17,8 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import expert
 from geomoe3d.errors import CheckpointError
 from geomoe3d.features.learned import DIMENSION
+from geomoe3d.runtime.files import file_hash
+from geomoe3d.runtime.tensors import read_tensors
 from geomoe3d.scoring.base import PairScorer, Scorer, scorer
 from geomoe3d.scoring.surface_channels import NUM_CHANNELS, SurfaceChannels, channels_of
 from geomoe3d.types import Float32Array, FloatArray
@@ -74,8 +74,7 @@ class SurfaceNetworkScorer(Scorer):
 
     def identity(self) -> dict[str, Any]:
         """With the hash of the weights."""
-        load_tensors(self._path)
-        return {**super().identity(), "weights": hashlib.sha256(self._path.read_bytes()).hexdigest()}
+        return {**super().identity(), "weights": file_hash(self._path, CheckpointError)}
 
     def about(self, pair: Pair) -> PairScorer:
         """See `Scorer`."""
@@ -109,22 +108,10 @@ def _linear(tensors: dict[str, Float32Array], name: str, x: Float32Array) -> Flo
     return found
 
 
-@cache
 def load_tensors(path: Path) -> dict[str, Float32Array]:
     """The tensors of a weight file by name, float32.
 
     Raises:
         CheckpointError: no such file, or it is none of this network's.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
-    try:
-        found = load_file(path)
-    except FileNotFoundError:
-        raise CheckpointError(f"no weights of the surface network at '{path}'") from None
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"weights of the surface network '{path}' cannot be read: {error}") from None
-    if "point.0.weight" not in found or found["point.0.weight"].shape[1] != NUM_CHANNELS:
-        raise CheckpointError(f"'{path}' holds no weights of the surface network")
-    return {name: tensor.astype(np.float32) for name, tensor in found.items()}
+    return read_tensors(path, "the surface network", "point.0.weight", (None, NUM_CHANNELS))

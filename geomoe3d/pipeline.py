@@ -81,8 +81,8 @@ class Pipeline:
         self.second_descriptor = _second_descriptor(config)
         self.matcher: Matcher = matcher.make(config.matching)
         _check_weights_are_wanted(config)
-        wanted = config.filter.name != "none"
-        self.filter: OutlierFilter | None = outlier_filter.make(config.filter) if wanted else None
+        made = outlier_filter.make(config.filter)  # also none, which takes no options
+        self.filter: OutlierFilter | None = None if config.filter.name == "none" else made
         self.estimator: Estimator = estimator.make(config.estimator)
         self.scorers: dict[str, Scorer] = make_scorers(config.scoring)
         self.second_scorers = _second_scorers(config, self.second_descriptor)

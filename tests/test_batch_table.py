@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from geomoe3d import register_pairs
+from geomoe3d.batch.folder import page_name, transform_name
 from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
 from geomoe3d.errors import FormatError, InputError
 
@@ -42,6 +43,9 @@ def test_paths_are_relative_to_the_table_and_ids_are_made_where_missing(tmp_path
         ("source,target,T_00\na,b,1\n", FormatError, "column 'T_00', which is nearly 'T00'"),
         ("source,target,ID\na,b,1\n", FormatError, "column 'ID', which is nearly 'id'"),
         ("source,target,id,id\na,b,1,2\n", FormatError, "more than one column 'id'"),
+        ("id,source,target\n../../evil,a,b\n", InputError, "line 2: the id '../../evil' cannot name files"),
+        ("id,source,target\nx,a,b\n.x,a,c\n", InputError, "line 3: the id '.x' .* must not begin with a dot"),
+        ("id,source,target\na/../b,a,b\n", InputError, "nor hold the part '..'"),
         ("source,target\na,b\na,1.ply,b\n", FormatError, "line 3 has more cells than the 2 .* 'b'; put"),
     ],
 )
@@ -55,6 +59,14 @@ def test_a_table_that_cannot_be_used_is_refused_with_its_line(tmp_path, text, ki
 def test_columns_unlike_any_known_one_and_empty_cells_beyond_the_last_are_ignored(tmp_path):
     (tmp_path / "t.csv").write_text("source,target,source_id,note,ids,scene\na,b,1,c,2,d,,\n")
     assert [row.id for row in read_pairs(tmp_path / "t.csv")] == ["a+b"]
+
+
+def test_ids_made_of_paths_never_hide_a_file(tmp_path):
+    (tmp_path / "t.csv").write_text("source,target,id\n../a.ply,b.ply,\n../a.ply,c.ply,../a.ply+c.ply\n")
+    ids = [row.id for row in read_pairs(tmp_path / "t.csv")]
+    assert ids == ["../a.ply+b.ply", "../a.ply+c.ply"]  # also where a table of results gives it back
+    assert transform_name(ids[0]) == "%2E.%2Fa.ply+b.ply.txt"
+    assert page_name(ids[1]) == "%2E.%2Fa.ply+c.ply.html"
 
 
 def test_tables_that_are_no_text_or_not_there(tmp_path):

@@ -100,10 +100,10 @@ def test_resume_after_sigkill_in_the_middle_of_a_scene(made: Path, tmp_path: Pat
 
 
 def test_other_settings_or_material_are_refused_by_name(made: Path) -> None:
-    with pytest.raises(InputError, match="seed was 3, now 5"):
+    with pytest.raises(InputError, match=r"seed \(3 there, 5 now\)"):
         synthesize(made, 2, seed=5, settings=TINY)
     changed = TINY.model_copy(update={"sensor": SensorSettings(far=3.0)})
-    with pytest.raises(InputError, match=r"settings\.sensor\.far was 4\.5, now 3\.0"):
+    with pytest.raises(InputError, match=r"settings\.sensor\.far \(4\.5 there, 3\.0 now\)"):
         synthesize(made, 2, seed=3, settings=changed)
 
 

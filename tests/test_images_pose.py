@@ -15,7 +15,7 @@ from geomoe3d.cli.main import geomoe3d
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, InputError, MissingFileError
 from geomoe3d.geometry.homography import weighted_dlt
 from geomoe3d.images.cameras import Camera, rotation_deg
-from geomoe3d.images.features import detect, match
+from geomoe3d.images.features import detect, match, read_grey
 from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
@@ -31,6 +31,24 @@ H = np.array([[0.9, -0.1, 40], [0.15, 1.0, -30], [1e-4, -5e-5, 1]])
 
 def angle_between(a, b):
     return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_damaged_image_is_refused(tmp_path, suffix):
+    """OpenCV takes it, with grey in place of what is lost."""
+    import cv2
+
+    path = tmp_path / f"photo{suffix}"
+    cv2.imwrite(str(path), texture())
+    whole = path.read_bytes()
+    assert read_grey(path).shape == texture().shape[:2]
+    middle = len(whole) // 2
+    for damaged in (whole[:middle], whole[:middle] + bytes(200) + whole[middle + 200 :]):
+        path.write_bytes(damaged)
+        with pytest.raises(
+            InputError, match=r"photo\..* (is damaged: .*copy it anew|cannot be read as an image)"
+        ):
+            read_grey(path)
 
 
 @pytest.mark.parametrize("estimator", ["magsac", "ransac", "eight_point"])

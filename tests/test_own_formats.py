@@ -72,7 +72,7 @@ def test_the_example_reads_and_writes_for_the_command_line(tmp_path: Path) -> No
     batch = ["batch", "pairs.csv", "out", "--workers", "1", "--no-cache"]
     assert run(tmp_path, *batch, *own).returncode == 0
     done = run(tmp_path, *batch)  # another reader, another batch
-    assert done.returncode == 2 and "they differ in readers..jsonl" in done.stderr, done.stderr
+    assert done.returncode == 2 and "They differ in readers..jsonl" in done.stderr, done.stderr
     (tmp_path / "mine.py").write_text(EXAMPLE.read_text() + "# other code\n")
     done = run(tmp_path, *batch, *own)
     assert done.returncode == 2 and "readers..jsonl.code" in done.stderr, done.stderr

@@ -16,7 +16,14 @@ import pytest
 import geomoe3d
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.prepare import prepare
-from geomoe3d.config import DescriptorConfig, EstimatorConfig, PartConfig, load_config
+from geomoe3d.config import (
+    DescriptorConfig,
+    EstimatorConfig,
+    FilterConfig,
+    PartConfig,
+    RegistrationConfig,
+    load_config,
+)
 from geomoe3d.data.sample import make_sample_pair, write_sample_pair
 from geomoe3d.errors import ConfigError
 from geomoe3d.estimators.base import estimator
@@ -113,6 +120,8 @@ def test_an_unfinished_class_and_wrong_options_are_named(tmp_path) -> None:
     with pytest.raises(ConfigError, match="not complete: it lacks __call__"):
         descriptor.find(f"{path}:Mine")
     spread = f"{EXAMPLES / 'descriptor.py'}:Spread"
+    with pytest.raises(ConfigError, match=r"\{'draws': 3\} are given, but the filter 'none' takes none"):
+        Pipeline(resolved(RegistrationConfig(filter=FilterConfig(options={"draws": 3}))))
     with pytest.raises(ConfigError, match=r"does not take these options \{'radius': 3\}"):
         descriptor.make(DescriptorConfig(name=spread, options={"radius": 3}))
 

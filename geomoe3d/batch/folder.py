@@ -168,12 +168,18 @@ def remove(paths: Iterable[Path]) -> None:
 
 def transform_name(name: str) -> str:
     """The file of the transform of a pair: its id, odd characters as %XX."""
-    return f"{quote(name, safe=' +=,@')}.txt"
+    return f"{_stem(name)}.txt"
 
 
 def page_name(name: str) -> str:
     """The file of the page of a pair."""
-    return f"{quote(name, safe=' +=,@')}.html"
+    return f"{_stem(name)}.html"
+
+
+def _stem(name: str) -> str:
+    """An id as a file name; a dot at its beginning is odd too, since it would hide the file."""
+    stem = quote(name, safe=" +=,@")
+    return f"%2E{stem[1:]}" if stem.startswith(".") else stem
 
 
 def pair_mark(name: str) -> str:

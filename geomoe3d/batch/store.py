@@ -40,7 +40,7 @@ from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
-from geomoe3d.runtime.provenance import differences, hardware, source_commit
+from geomoe3d.runtime.provenance import differences, hardware, in_words, source_commit
 
 
 @dataclass(frozen=True)
@@ -121,11 +121,11 @@ class BatchStore:
                 raise InputError(foreign(path))
         if (folder / TABLE_FILE).exists() and not has_mark(folder / TABLE_FILE, TABLE_HEAD):
             raise InputError(foreign(folder / TABLE_FILE))
-        differing = [] if stored is None or fresh else differences(stored, self._identity)
+        differing = {} if stored is None or fresh else differences(stored, self._identity)
         if differing:
             raise InputError(
-                f"'{folder}' holds results of another batch; they differ in {'; '.join(differing)}. "
-                "Give another folder, or --fresh (fresh=True) to begin anew"
+                f"'{folder}' holds results of another batch; give another folder, or --fresh (fresh=True) to begin "
+                f"anew. They differ in {in_words(differing)}"
             )
 
     def begin(self) -> None:

@@ -175,6 +175,19 @@ def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow
     return rows
 
 
+def _check_id(name: str, where: str) -> None:
+    """An id names files: it is no path out of their folder, and hides none.
+
+    Raises:
+        InputError: it begins with a dot, or holds the part ``..``.
+    """
+    if name.startswith(".") or ".." in name.replace("\\", "/").split("/"):
+        raise InputError(
+            f"{where}: the id '{name}' cannot name files: it must not begin with a dot nor hold the part '..'; "
+            "give another one in the column id"
+        )
+
+
 def _check_columns(path: Path, columns: list[str]) -> None:
     if not any(columns):
         raise InputError(f"'{path}' is empty; its first line must name the columns source and target")
@@ -227,7 +240,10 @@ def _row(values: dict[str, str], folder: Path, where: str) -> PairRow:
                 f"{where}: the first guess must be 16 numbers in T00 to T33, or none; found {cells}"
             ) from None
         initial = _motion(np.reshape(numbers, (4, 4)), where)
-    name = values.get("id") or f"{source}+{target}"
+    of_files = f"{source}+{target}"
+    name = values.get("id") or of_files
+    if name != of_files:
+        _check_id(name, where)
     return PairRow(name, str((folder / source).resolve()), str((folder / target).resolve()), initial)
 
 

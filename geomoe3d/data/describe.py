@@ -128,7 +128,9 @@ def describe_collection(
             continue
         reason = why_stale(target, settings, source)
         if reason is not None:
-            raise FormatError(f"shard '{target}' is stale: {reason}; remove it, or give another folder")
+            raise FormatError(
+                f"shard '{target}' is stale; remove it, or give another folder. It has {reason}"
+            )
         open_shard(target, verify=True)
         report.kept += 1
     done = report.kept

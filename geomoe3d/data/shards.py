@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.types import Float32Array, FloatArray
 
 SHARD_VERSION = 1
@@ -134,13 +135,13 @@ def why_stale(folder: str | Path, settings: dict[str, Any], source: str | None =
     """
     meta = read_meta(folder)
     if meta["version"] != SHARD_VERSION:
-        return f"it has version {meta['version']}, this is version {SHARD_VERSION}"
+        return f"version {meta['version']}, this is version {SHARD_VERSION}"
     found = meta.get("settings", {})
-    changed = [key for key in sorted({*found, *settings}) if found.get(key) != settings.get(key)]
-    if changed:
-        return "; ".join(f"{key} was {found.get(key)}, now {settings.get(key)}" for key in changed)
+    differing = differences(found, settings)
+    if differing:
+        return f"other settings: {in_words(differing)}"
     if source is not None and meta.get("source") != source:
-        return f"the fragments it came from have changed ({meta.get('source')}, now {source})"
+        return f"other fragments now than those it came from ({meta.get('source')}, now {source})"
     return None
 
 

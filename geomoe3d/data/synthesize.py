@@ -28,6 +28,7 @@ from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
 MANIFEST = "manifest.json"
@@ -276,11 +277,11 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
                 found = json.loads(path.read_text())
             except ValueError as error:
                 raise InputError(f"'{path}' is damaged ({error}); give a new folder") from None
-            differing = _differences(_completed(found), manifest)
+            differing = differences(_completed(found), manifest)
             if differing:
-                reasons = "; ".join(differing)
                 raise InputError(
-                    f"'{folder}' was made otherwise: {reasons}. Give a new folder or equal values"
+                    f"'{folder}' was made with other values; give a new folder, or the same values. They differ in "
+                    f"{in_words(differing)}"
                 )
         elif any(folder.iterdir()):
             raise OutputError(f"'{folder}' holds files but no {MANIFEST}; give a new folder")
@@ -294,18 +295,8 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
         raise OutputError(f"cannot write into '{folder}': {error.strerror or error}") from None
 
 
-def _completed(manifest: Any) -> Any:
+def _completed(manifest: Any) -> dict[str, Any]:
     """A folder that names no recorder was made when there was the camera alone."""
     if isinstance(manifest, dict) and isinstance(manifest.get("settings"), dict):
         return {**manifest, "settings": {"recorder": "camera", **manifest["settings"]}}
-    return manifest
-
-
-def _differences(found: Any, wanted: Any, where: str = "") -> list[str]:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        lines = []
-        for key in sorted({*found, *wanted}):
-            name = f"{where}.{key}" if where else str(key)
-            lines += _differences(found.get(key), wanted.get(key), name)
-        return lines
-    return [] if found == wanted else [f"{where} was {found}, now {wanted}"]
+    return manifest if isinstance(manifest, dict) else {"manifest": manifest}

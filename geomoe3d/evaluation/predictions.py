@@ -21,7 +21,7 @@ from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.journal import Journal, read_journal
-from geomoe3d.runtime.provenance import differences
+from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.types import BoolArray, FloatArray
 
 RUN_FILE = "run.json"
@@ -44,8 +44,8 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
         differing = differences(_compared(read_info(folder)), _compared(info))
         if differing:
             raise InputError(
-                f"'{folder}' holds predictions of another run; they differ in {'; '.join(differing)}. "
-                "Give another folder or label, or --fresh to predict again"
+                f"'{folder}' holds predictions of another run; give another folder or label, or --fresh to predict "
+                f"again. They differ in {in_words(differing)}"
             )
     else:
         if (folder / PREDICTIONS_FILE).is_file() and (folder / PREDICTIONS_FILE).stat().st_size:

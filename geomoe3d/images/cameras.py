@@ -27,6 +27,21 @@ def opencv() -> Any:
     return cv2
 
 
+def simplejpeg() -> Any:
+    """What decodes a JPEG and tells where it is damaged.
+
+    Raises:
+        DependencyError: it is not installed.
+    """
+    try:
+        import simplejpeg
+    except ImportError as error:
+        raise DependencyError(
+            f"JPEG images need simplejpeg ({error}); install it with: pip install 'geomoe3d[images]'"
+        ) from None
+    return simplejpeg
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics of one image.

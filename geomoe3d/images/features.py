@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import warnings
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
@@ -10,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import InputError, MissingFileError
-from geomoe3d.images.cameras import opencv
+from geomoe3d.errors import FormatError, InputError, MissingFileError
+from geomoe3d.images.cameras import opencv, simplejpeg
 from geomoe3d.types import BoolArray, Float32Array, FloatArray
 
 Detector = Literal["rootsift", "sift", "orb"]
@@ -70,6 +72,8 @@ def read_grey(path: str | Path) -> NDArray[np.uint8]:
     Raises:
         MissingFileError: there is none.
         InputError: OpenCV cannot read it.
+        FormatError: it is damaged or cut short.
+        DependencyError: OpenCV or, for a JPEG, simplejpeg is not installed.
     """
     cv2 = opencv()
     if Path(path).is_dir():
@@ -81,7 +85,31 @@ def read_grey(path: str | Path) -> NDArray[np.uint8]:
     )
     if image is None:
         raise InputError(f"'{path}' cannot be read as an image; convert it to PNG or JPEG")
+    _check_whole(Path(path))
     return image
+
+
+def _check_whole(path: Path) -> None:
+    """Refuse a damaged image: OpenCV fills what it cannot decode with grey and says so on the terminal alone."""
+    from PIL import Image, UnidentifiedImageError
+
+    content = path.read_bytes()
+    try:
+        if content.startswith(b"\xff\xd8\xff"):
+            jpeg = simplejpeg()  # Pillow sees a JPEG cut short, but no damage inside
+            kind = jpeg.decode_jpeg_header(content, strict=True)[2]
+            jpeg.decode_jpeg(content, "CMYK" if kind in ("CMYK", "YCCK") else "GRAY", strict=True)
+            return
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # photographs may be large
+            with Image.open(io.BytesIO(content)) as image:
+                image.load()
+    except (UnidentifiedImageError, Image.DecompressionBombError):
+        return  # a kind, or a size, that OpenCV alone reads
+    except (OSError, SyntaxError, ValueError) as error:
+        raise FormatError(
+            f"'{path}' is damaged: {error}; copy it anew from the camera, or, if it looks whole, save it again"
+        ) from None
 
 
 def detect(

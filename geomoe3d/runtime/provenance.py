@@ -52,14 +52,25 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
-def differences(stored: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
-    """What differs between two identities (nested plain JSON), in words, by name."""
+def differences(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, tuple[str, str]]:
+    """What differs between two identities (nested plain JSON): name -> (there, now), as JSON or ``absent``."""
     old, new = _flat(stored), _flat(wanted)
-    return [
-        f"{key} ({old.get(key, 'absent')} there, {new.get(key, 'absent')} now)"
+    return {
+        key: (old.get(key, "absent"), new.get(key, "absent"))
         for key in sorted(old.keys() | new.keys())
         if old.get(key) != new.get(key)
-    ]
+    }
+
+
+def in_words(differing: dict[str, tuple[str, str]], most: int = 3, longest: int = 60) -> str:
+    """Differences in one line: the first few with their values, and how many more there are."""
+
+    def short(value: str) -> str:
+        return value if len(value) <= longest else f"{value[: longest - 3]}..."
+
+    told = [f"{key} ({short(a)} there, {short(b)} now)" for key, (a, b) in list(differing.items())[:most]]
+    rest = len(differing) - len(told)
+    return "; ".join(told) + (f"; and in {rest} more" if rest else "")
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, str]:

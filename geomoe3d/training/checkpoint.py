@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from geomoe3d.errors import CheckpointError, MissingWeightsError
 from geomoe3d.runtime.files import write_atomically
-from geomoe3d.runtime.provenance import source_commit
+from geomoe3d.runtime.provenance import differences, in_words, source_commit
 from geomoe3d.training.config import FREE_KEYS, TrainConfig
 
 _FORMAT = "geomoe3d-checkpoint"
@@ -73,24 +73,15 @@ def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: 
             f"'{path}' was made by another version of geomoe3d, whose settings this one does not know "
             f"({keys}); train into another folder"
         ) from None
-    changed = [key for key in _differences(before.model_dump(), config.model_dump()) if not _is_free(key)]
+    differing = differences(before.model_dump(mode="json"), config.model_dump(mode="json"))
+    changed = {key: values for key, values in differing.items() if not _is_free(key)}
     if changed:
         raise CheckpointError(
-            f"'{path}' was made with other settings ({', '.join(changed)}); set them back, or train into "
-            f"another folder (start from these weights with init_from)"
+            f"'{path}' was made with other settings; set them back, or train into another folder (start from these "
+            f"weights with init_from). They differ in {in_words(changed)}"
         )
     if state["data"] != data:
         raise CheckpointError(f"'{path}' was trained on other data: {state['data']}, now {data}")
-
-
-def _differences(a: dict[str, Any], b: dict[str, Any], prefix: str = "") -> list[str]:
-    keys: list[str] = []
-    for name in a:
-        if isinstance(a[name], dict) and isinstance(b[name], dict):
-            keys += _differences(a[name], b[name], f"{prefix}{name}.")
-        elif a[name] != b[name]:
-            keys.append(prefix + name)
-    return keys
 
 
 def _is_free(key: str) -> bool:

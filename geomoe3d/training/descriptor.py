@@ -24,6 +24,7 @@ from geomoe3d.config import Section
 from geomoe3d.errors import CheckpointError, OutputError
 from geomoe3d.features.learned import LEARNED, load_tensors
 from geomoe3d.runtime.files import write_atomically, write_text
+from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.training.descriptor_network import WIDTH, DescriptorNetwork
 from geomoe3d.training.descriptor_pairs import ContrastBatch, ContrastPairs
 from geomoe3d.training.distributed import Process, choose_device
@@ -203,10 +204,11 @@ class DescriptorRun:
             before = DescriptorTrainConfig.model_validate_json(state["config"])
         except Exception as error:  # torch names no common class for what a damaged file raises
             raise CheckpointError(f"checkpoint '{self.last_path}' cannot be read: {error}") from None
-        if before.model_dump(exclude=_FREE_KEYS) != self.config.model_dump(exclude=_FREE_KEYS):
+        there, now = (one.model_dump(mode="json", exclude=_FREE_KEYS) for one in (before, self.config))
+        if there != now:
             raise CheckpointError(
-                f"'{self.last_path}' was made with other settings: {before.model_dump_json()}; set them "
-                "back, or train into another folder"
+                f"'{self.last_path}' was made with other settings; set them back, or train into another folder. "
+                f"They differ in {in_words(differences(there, now))}"
             )
         self.network.load_state_dict(state["network"])
         self.averaged.load_state_dict(state["averaged"])

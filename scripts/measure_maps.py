@@ -245,7 +245,7 @@ def indexed_apart(building: Building, out: Path) -> tuple[Map, float]:
 
 def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Map | None) -> dict[str, Any]:
     """What a method says of one query, as a line of the journal."""
-    begin = time.perf_counter()
+    begin, worked = time.perf_counter(), time.process_time()
     line: dict[str, Any] = {}
     if made is not None:
         found = made.locate(scan, k=ALIKE)
@@ -257,6 +257,7 @@ def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Ma
         T = PEERS[method](given).T_target_source
         places = []
     line["seconds"] = time.perf_counter() - begin
+    line["processor_seconds"] = time.process_time() - worked
     if query.truth is not None:
         line["right"] = is_right(*motion_errors(T, query.truth))
         line["among"] = any(is_right(*motion_errors(place, query.truth)) for place in places)

@@ -111,6 +111,8 @@ def own_voxel_sizes(source: PointCloud, target: PointCloud, num_points: int) -> 
         # Where foliage fills space, a grid for surfaces shows next to nothing of it.
         return max(size / 2 if size > least and _fills_space(cloud.points, size) else size, least)
 
+    if source is target:
+        return (size := of(source)), size
     first, second = each(of, (source, target))
     return first, second
 

@@ -26,7 +26,8 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 Look = Literal["quick", "more", "finer"]
-"""At the likeliest windows; at more of them with more matches; around what was found, on the scan's own grid."""
+"""At the likeliest windows; at more of them with more matches, on a coarse grid; around what was found, on the grid of the
+scan itself."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Finder:
         rule = self.line.config.preparation.viewpoint
         view = find_viewpoints(cloud, cloud, rule)[0]
         local = [shift_frames(T, -cloud.origin, -self.voxels.origin) for T in guesses]
-        own, coarsest = self._grids(cloud)
+        own, sought, coarsest = self._grids(cloud)
         level = self.level_for(own, coarsest)
         search = self._begun(cloud, view, level, clock)
         known: list[FloatArray] = []
@@ -76,6 +77,8 @@ class Finder:
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
+            if look == "more" and expert().maps.finer * search.level.voxel_size < sought:
+                search = self._begun(cloud, view, self.level_for(sought, coarsest), clock)
             if look == "finer":
                 finer = self._around(search, known[:count], own)
                 if finer is None:
@@ -102,14 +105,17 @@ class Finder:
             decision = decision.with_note(sentence)
         return replace(best, decision=decision), ranked
 
-    def _grids(self, cloud: PointCloud) -> tuple[float, float]:
-        """Edges of the grid that suits a scan, and of the coarsest one that serves it."""
+    def _grids(self, cloud: PointCloud) -> tuple[float, float, float]:
+        """Edges of the grid that suits a scan, of the one on which it is sought again, and of the coarsest that serves
+        it."""
         preparation, given = self.line.config.preparation, self.line.config.voxel_size
         own = given or choose_voxel_size(cloud, cloud, preparation.voxel_points)
         own = bounded_voxel_size(cloud, cloud, own, preparation.max_points)
         if given is not None:
-            return own, expert().maps.finer * own
-        return own, max(own, choose_voxel_size(cloud, cloud, expert().maps.least_voxels))
+            return own, own, expert().maps.finer * own
+        known = expert().maps.sought_voxels, expert().maps.least_voxels
+        sought, coarsest = (max(own, choose_voxel_size(cloud, cloud, count)) for count in known)
+        return own, sought, coarsest
 
     def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
         """The search for a scan on a level."""

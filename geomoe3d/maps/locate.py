@@ -24,7 +24,7 @@ from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Compared, Level
-from geomoe3d.maps.places import Query
+from geomoe3d.maps.places import Query, Window
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
@@ -113,16 +113,7 @@ class Search:
         most = known.more_windows if more else known.windows
         windows = self._query.windows(math.ceil(times * most), within)
         self._clock("propose")
-        scored = [(self._quick(T), Hypothesis(T)) for T in given]
-        # What was known before did not convince, or it would not be asked again.
-        plain = max([known.plain, *(1.05 * score for score, _ in scored)]) if more else known.plain
-        for number, window in enumerate(windows):
-            if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
-                break
-            proposed = self._query.motions(window, known.per_window, more=more)
-            if near is not None:
-                proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
-            scored += [(self._quick(h.T_target_source), h) for h in proposed]
+        scored = self._proposed(windows, near, given, times, more)
         scored.sort(key=lambda item: -item[0])
         chosen: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in scored:
@@ -132,7 +123,8 @@ class Search:
                 chosen.append((score, hypothesis))
         polished = [
             Hypothesis(self._polished(h.T_target_source))
-            for _, h in chosen[: math.ceil(times * known.polished)]
+            for score, h in chosen[: math.ceil(times * known.polished)]
+            if score >= known.worth_polishing * chosen[0][0]
         ]
         both = [*chosen, *((self._quick(h.T_target_source), h) for h in polished)]
         best: list[tuple[float, Hypothesis]] = []
@@ -140,6 +132,40 @@ class Search:
             if all(self.differ(hypothesis, other) for _, other in best):
                 best.append((score, hypothesis))
         return best
+
+    def _proposed(
+        self,
+        windows: Sequence[Window],
+        near: tuple[FloatArray, float] | None,
+        given: Sequence[FloatArray],
+        times: float,
+        more: bool,
+    ) -> list[tuple[float, Hypothesis]]:
+        """Motions into windows, and those that were given, with their quick scores; see `candidates`.
+
+        Once one fits plainly, of the other windows only those are looked into that may hold another such place.
+        """
+        known = expert().locating
+        scored = [(self._quick(T), Hypothesis(T)) for T in given]
+        # What was known before did not convince, or it would not be asked again.
+        plain = max([known.plain, *(1.05 * score for score, _ in scored)]) if more else known.plain
+        found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
+        for number, window in enumerate(windows):
+            if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
+                break
+            if found is not None and window.votes < known.rival_votes * found[0]:
+                break
+            if found is not None and np.linalg.norm(window.center - found[1]) < self._query.radius:
+                continue
+            proposed = self._query.motions(window, known.per_window, more=more)
+            if near is not None:
+                proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
+            fresh = [(self._quick(h.T_target_source), h) for h in proposed]
+            scored += fresh
+            best = max(fresh, key=_score, default=None)
+            if found is None and times == 1.0 and best is not None and best[0] > max(plain, known.plainest):
+                found = window.votes, transform_points(best[1].T_target_source, self.center[None])[0]
+        return scored
 
     def differ(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two motions are clearly different."""
@@ -259,6 +285,10 @@ class Search:
         part = replace(self._part, viewpoint=None if self.scan.viewpoint is None else eye)
         self._clock("features")
         return level.seen_from(eye, rows, part, self._line.descriptor, fully)
+
+
+def _score(candidate: tuple[float, Hypothesis]) -> float:
+    return candidate[0]
 
 
 def likely(candidates: Sequence[tuple[float, Hypothesis]], most: int) -> Iterator[Hypothesis]:

@@ -14,7 +14,7 @@ from geomoe3d.cli.errors import BAD_INPUT, OK, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.raw import RawCloud
-from geomoe3d.config import load_config
+from geomoe3d.config import expert, load_config
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
 from geomoe3d.features.base import with_features
 from geomoe3d.features.learned import LearnedDescriptor
@@ -24,6 +24,7 @@ from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps import store
 from geomoe3d.maps.facing import both_sides, facing_alike
 from geomoe3d.maps.pieces import pieces
+from geomoe3d.maps.places import Query
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.types import PreparedCloud
 
@@ -84,8 +85,34 @@ def test_of_alike_rooms_none_is_ok_and_all_are_named(rooms, scan):
         assert min(shift(place.T_map_scan, twin) for place in found.places) < 0.1
 
 
-def test_a_scan_of_another_building_is_not_ok(rooms, scan):
-    assert not Map.from_cloud(scanned(rooms[1], UTM, 2), voxel_size=GRID).locate(scan[0]).ok
+def test_the_twin_of_a_room_is_seen_though_the_first_place_fits_plainly(rooms, scan):
+    room = scanned(rooms[0], UTM, 1)
+    found = Map.from_cloud(np.concatenate([room, room + AWAY]), voxel_size=GRID).locate(scan[0])
+    assert found.status == "ambiguous"
+    assert sorted(round(shift(place.T_map_scan, scan[1])) for place in found.places[:2]) == [0, 7]
+
+
+def test_where_one_place_fits_plainly_only_windows_of_rivals_are_looked_into(house, scan, monkeypatch):
+    looked = []
+
+    def motions(self, window, count, *, more=False, _made=Query.motions):
+        looked.append(window.votes)
+        return _made(self, window, count, more=more)
+
+    monkeypatch.setattr(Query, "motions", motions)
+    assert house.locate(scan[0]).ok
+    assert 1 <= len(looked) < expert().locating.first_windows
+    looked.clear()
+    assert house.locate(scan[0], k=30).ok  # more places are asked for: all windows are looked into
+    assert len(looked) >= expert().locating.first_windows
+
+
+def test_a_scan_of_another_building_is_not_ok_and_is_sought_on_a_coarser_grid_too(rooms, scan):
+    made = Map.empty().with_cloud(scanned(rooms[1], UTM, 2))
+    made.describe(GRID / 2)
+    assert not made.locate(scan[0]).ok
+    assert made.voxel_sizes[0] == pytest.approx(GRID / 2)
+    assert made.voxel_sizes[-1] > 1.3 * GRID / 2
 
 
 def test_a_place_that_is_given_is_looked_at_and_not_trusted(house, scan):

@@ -26,8 +26,8 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 Look = Literal["quick", "more", "finer"]
-"""At the likeliest windows; at more of them with more matches, on a coarse grid; around what was found, on the grid of the
-scan itself."""
+"""At the likeliest windows; at more of them, with more matches and on a coarse grid; around what was found, on the
+scan's own grid."""
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,8 @@ class Query:
         from scipy.spatial import cKDTree
 
         level, edge = self.level.compared, self.radius / 1.5
-        most = min(expert().places.voting, expert().places.most_votes // max(len(level.features), 1))
-        asked = self._scan.features[:: math.ceil(len(self._scan.features) / max(most, 1))]
+        limit = min(expert().places.voting, expert().places.most_votes // max(len(level.features), 1))
+        asked = self._scan.features[:: math.ceil(len(self._scan.features) / max(limit, 1))]
         cells = np.floor(level.points / edge).astype(np.int64)
         cells -= cells.min(0)
         shape = cells.max(0) + 1

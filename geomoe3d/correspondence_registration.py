@@ -24,6 +24,7 @@ from geomoe3d.geometry.se3 import residuals, shift_frames
 from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
+from geomoe3d.runtime.words import counted
 from geomoe3d.scoring.network import NETWORK, opinion_of
 from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray, Hypothesis, PreparedCloud
 
@@ -283,7 +284,7 @@ def check_rows(correspondences: ArrayLike | Correspondences) -> FloatArray:
     bad = ~np.isfinite(rows).all(axis=1)
     if bad.any():
         raise InputError(
-            f"{int(bad.sum())} of {len(rows)} correspondences hold NaN or infinities, first in row "
+            f"{int(bad.sum())} of {counted(len(rows), 'correspondence')} hold NaN or infinities, first in row "
             f"{int(bad.argmax())}; leave them out"
         )
     return rows

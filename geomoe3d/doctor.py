@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from geomoe3d.runtime.machine import Machine
+from geomoe3d.runtime.words import counted
 
 State = Literal["ok", "missing", "broken"]
 
@@ -267,7 +268,7 @@ def _check_torch(machine: Machine) -> Finding:
     version, cuda, available, threads = fields
     build = "CPU build" if cuda == "-" else f"CUDA {cuda} build"
     device = "GPU usable" if available == "True" else "no GPU usable"
-    return Finding("torch", "ok", f"{version}, {build}, {device}, {threads} threads")
+    return Finding("torch", "ok", f"{version}, {build}, {device}, {counted(int(threads), 'thread')}")
 
 
 def _check_module(machine: Machine, module: str, requirement: str, purpose: str = "") -> Finding:

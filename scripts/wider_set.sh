@@ -29,7 +29,7 @@ describe() { # FRAGMENTS GRID [OPTION...]: descriptions at a grid in millimetres
 }
 motions() { # DESCRIPTIONS NAME PAIRS
   mkdir -p "$out"
-  data motions "$set/$1" "$out/$2" --pairs "$3"
+  data transforms "$set/$1" "$out/$2" --pairs "$3"
 }
 
 data synthesize "$set/scans" --set recorder=scanner --set grid=0.05 --set min_points=1500 --scenes 60 --seed 0 --models "$models"

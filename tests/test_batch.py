@@ -299,7 +299,7 @@ def copied(finished, tmp_path):
 @pytest.mark.parametrize(
     ("named", "kind", "message"),
     [
-        ({"workers": 1000}, InputError, "1000 workers would take"),
+        ({"workers": 1000}, InputError, "1,000 workers would take"),
         ({"workers": 1, "scheduler": "tcp://127.0.0.1:1"}, InputError, "either workers or a scheduler"),
         ({"scheduler": "tcp://127.0.0.1:1"}, DependencyError, "needs Dask"),
         ({"cache": __file__}, OutputError, "is a file; the cache of features is a folder"),

@@ -239,7 +239,7 @@ def test_shipped_configurations_are_found_by_name_from_anywhere(tmp_path, monkey
 
     monkeypatch.chdir(tmp_path)
     assert load_config("configs/default.yaml") == RegistrationConfig()
-    assert load_train_config("configs/train/motions.yaml").data.train
+    assert load_train_config("configs/train/transforms.yaml").data.train
     assert load_train_config("configs/train/paper/oanet.yaml")  # has a base beside it
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "default.yaml").write_text("seed: 5")
@@ -247,8 +247,10 @@ def test_shipped_configurations_are_found_by_name_from_anywhere(tmp_path, monkey
 
 
 def test_a_missing_configuration_names_the_nearest_that_comes_with_the_package():
-    with pytest.raises(FileNotFoundError, match=r"did you mean configs/train/motions\.yaml"):
-        load_config("configs/train/motion.yaml")
+    with pytest.raises(FileNotFoundError, match=r"did you mean configs/train/transforms\.yaml"):
+        load_config("configs/train/transform.yaml")
+    with pytest.raises(FileNotFoundError, match=r"it is now configs/train/transforms\.yaml"):
+        load_config("configs/train/motions.yaml")
 
 
 def test_a_key_that_stands_twice_in_a_file_is_refused(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_truncated_and_lying_las(tmp_path: Path, suffix: str) -> None:
     path.write_bytes(whole[:-300])
     fails(path, "says 100 points", "holds")
     path.write_bytes(whole[:107] + struct.pack("<I", 150_000) + whole[111:])
-    fails(path, "says 150000 points", "holds 100;" if suffix == ".las" else "holds 1 chunks")
+    fails(path, "says 150000 points", "holds 100;" if suffix == ".las" else "holds 1 chunk of")
     path.write_bytes(whole[:107] + struct.pack("<I", 60) + whole[111:])  # PDAL reads so many too
     cloud = load_points(path)
     np.testing.assert_allclose(cloud.file_points, small_cloud()[:60], atol=1e-6)

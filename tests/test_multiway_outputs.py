@@ -134,7 +134,7 @@ def test_poses_are_read_as_they_were_written(tmp_path, kind):
     ("text", "message"),
     [
         ("1 2 3\n", "TUM hold 8, all of KITTI 12"),
-        ("0 0 0 0 0 0 0 1\n", "1 poses for 2 scans"),
+        ("0 0 0 0 0 0 0 1\n", "1 pose for 2 scans"),
         ('{"a": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "no pose for 'b'"),
         ("[[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]],[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]", "rot"),
     ],

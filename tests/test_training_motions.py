@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from corner_scenes import VOXEL, random_motion, scene, seen_corner
 from judged_motions import SMALL, training_pair
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.cli.main import geomoe3d
 from geomoe3d.config import build_config
 from geomoe3d.data.shards import DescribedScene
 from geomoe3d.data.shards import write_shard as write_described
@@ -73,7 +75,7 @@ def test_a_right_motion_is_among_those_chosen_for_training() -> None:
         np.testing.assert_array_equal(chosen[right][0], T)
         np.testing.assert_array_equal(chosen[:2], motions[:2])
     assert not choose_motions(pair, 6, None)[1].any()  # the first six, in validation
-    with pytest.raises(InputError, match="data motions"):
+    with pytest.raises(InputError, match="data transforms"):
         choose_motions(training_pair(), 6, None)
 
 
@@ -111,7 +113,15 @@ def test_settings_that_do_not_fit_a_network_that_judges_motions_are_refused() ->
         build_config(TrainConfig, {"network": SMALL})
     with pytest.raises(ConfigError, match="best_metric=verdict"):
         build_config(TrainConfig, {"validation": {"best_metric": "verdict"}})
-    assert load_train_config("configs/train/motions.yaml").network.judges_motions
+    assert load_train_config("configs/train/transforms.yaml").network.judges_motions
+
+
+def test_the_old_name_of_the_verb_is_an_error_that_names_the_new_one() -> None:
+    for words in (["features", "out", "--pairs", "5"], []):
+        refused = CliRunner().invoke(geomoe3d, ["data", "motions", *words])
+        assert refused.exit_code == 2
+        assert "'data motions' is now 'data transforms'" in refused.output
+    assert "motions" not in CliRunner().invoke(geomoe3d, ["data", "--help"]).output
 
 
 @pytest.fixture

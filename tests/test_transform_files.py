@@ -138,7 +138,7 @@ def test_first_guesses_of_other_programs(tmp_path: Path, number: int) -> None:
         ("hello world", "hello"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "2 rows"),
         ("1 0 0 0 5 6 7", "the order is tx ty tz"),
-        ("{}", "0 motions"),
+        ("{}", "0 transforms"),
         ('{"pipeline": [{"type": "filters.transformation", "matrix": "1 2 x"}]}', "x"),
         ("transform:\n  translation: {x: 1, y: 2}\n  rotation: {x: 0, y: 0, z: 0, w: 1}\n", "z"),
         ("static_transform_publisher 1 2 3 map scan", "3 numbers"),

@@ -17,6 +17,7 @@ from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.journal import Journal
+from geomoe3d.runtime.words import counted
 
 RUN_FILE, JOURNAL_FILE = "run.json", "journal.jsonl"
 RESULTS_FILE, TABLE_FILE = "results.jsonl", "results.csv"
@@ -110,8 +111,8 @@ def _check_files(place: Path, names: dict[str, str], is_own: Callable[[Path], bo
         length = len(file.encode())
         if length > _LONGEST_NAME:
             raise InputError(
-                f"the id '{name}' makes a file name of {length} bytes, at most {_LONGEST_NAME} are possible; "
-                f"give shorter ones in the column id, {what}"
+                f"the id '{name}' makes a file name of {counted(length, 'byte')}, at most {_LONGEST_NAME} are "
+                f"possible; give shorter ones in the column id, {what}"
             )
         path = place / file
         if path.exists() and not is_own(path):

@@ -10,6 +10,7 @@ from geomoe3d.batch.table import PairRow
 from geomoe3d.errors import InputError
 from geomoe3d.runtime.machine import Machine
 from geomoe3d.runtime.provenance import usable_cores
+from geomoe3d.runtime.words import counted
 
 _BASE_BYTES = 750 * 2**20  # libraries, torch among them, a block of the similarity matrix, described clouds
 _PER_FILE_BYTE = 5  # binary PLY of single floats: 12 bytes a point in the file, some 60 while it is thinned
@@ -57,7 +58,7 @@ def choose_workers(wanted: int | None, each: int) -> tuple[int, int | None]:
     fitting = max(1, free // each)
     if wanted is not None and wanted > fitting:
         raise InputError(
-            f"{wanted} workers would take about {gibibytes(wanted * each)}, but only {gibibytes(free)} are "
+            f"{counted(wanted, 'worker')} would take about {gibibytes(wanted * each)}, but only {gibibytes(free)} are "
             f"free; use at most --workers {fitting}"
         )
     workers = wanted or min(usable_cores(), fitting)

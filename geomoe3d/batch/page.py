@@ -27,6 +27,7 @@ from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.progress import Watch, shows_progress
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import STATUS_WORDS, thin
 from geomoe3d.visual.templates import render
@@ -88,7 +89,7 @@ def render_batch_page(
     return render(
         "batch/page.html",
         generator=Markup(PAGE_MARK),
-        title=f"{len(rows):,} pairs",
+        title=counted(len(rows), "pair"),
         counts=", ".join(f"{count:,} {_word(status)}" for status, count in sorted(counts.items())),
         statuses=[(status, count, _word(status)) for status, count in sorted(counts.items())],
         cards=[_card(rows[k], outcomes[k], *pictures.get(k, ("", _UNDRAWN)), pages) for k in order],

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, refuse_bare_settings, renamed, traceback_option
+from geomoe3d.cli.errors import BAD_INPUT, HELP, refuse_bare_settings, renamed, renamed_verb, traceback_option
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.data.check import CheckReport
@@ -54,8 +55,9 @@ def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None
         click.echo(json.dumps(asdict(truth)) if as_json else (
             f"{root}: photographs with cameras, layout {truth.layout}, {truth.num_views} views"
             + "".join(f"\nnote: {note}" for note in truth.notes)
-            + f"\n{truth.num_matches:,} matches of {truth.num_pairs} pairs: {truth.share:.0%} within 2 pixels of their "
-            f"epipolar lines (at least 60 %), median {truth.median:.2f} (at most 1)\n"
+            + f"\n{counted(truth.num_matches, 'match', 'matches')} of {counted(truth.num_pairs, 'pair')}: "
+            f"{truth.share:.0%} within 2 pixels of their epipolar lines (at least 60 %), median {truth.median:.2f} "
+            "(at most 1)\n"
             + ("usable" if truth.usable else "not usable: the cameras are not those of the photographs")
         ))  # fmt: skip
         context.exit(0 if truth.usable else BAD_INPUT)
@@ -71,7 +73,7 @@ def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None
 def _print(report: CheckReport) -> None:
     click.echo(f"{report.root}: layout {report.layout}")
     pairs = ", ".join(f"{count} {group}" for group, count in report.num_pairs.items()) or "no pairs"
-    click.echo(f"{report.num_scenes} scenes, {report.num_fragments} fragments, {pairs}")
+    click.echo(f"{counted(report.num_scenes, 'scene')}, {counted(report.num_fragments, 'fragment')}, {pairs}")
     for row in report.scenes:
         split = f" [{row['split']}]" if row["split"] else ""
         published = f" of {row['published_fragments']}" if row["published_fragments"] else ""
@@ -165,7 +167,8 @@ def fragments(
         click.echo(f"skipped: {line}", err=True)
     points = ", ".join(str(number) for number in report.num_points)
     click.echo(
-        f"{len(report.num_points)} fragments ({points} points), {report.num_pairs} pairs in {out}/gt.log"
+        f"{counted(len(report.num_points), 'fragment')} ({points} points), {counted(report.num_pairs, 'pair')} in "
+        f"{out}/gt.log"
     )
 
 
@@ -306,7 +309,8 @@ def features(
     for line in report.skipped:
         click.echo(f"skipped: {line}", err=True)
     click.echo(
-        f"{report.made} shards made ({report.num_fragments} fragments, {report.num_pairs} pairs), "
+        f"{counted(report.made, 'shard')} made ({counted(report.num_fragments, 'fragment')}, "
+        f"{counted(report.num_pairs, 'pair')}), "
         f"{report.kept} kept, in {out}"
     )
     context.exit(0 if report.made or report.kept else BAD_INPUT)
@@ -324,11 +328,11 @@ def features(
 @click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
 @traceback_option
 @click.pass_context
-def motions(context: click.Context, features: str, out: str, pairs: int, seed: int, workers: int) -> None:
+def transforms(context: click.Context, features: str, out: str, pairs: int, seed: int, workers: int) -> None:
     """Draw pairs from the shards FEATURES and store them with the transforms that consensus proposes in OUT.
 
     FEATURES is what 'geomoe3d data features' made. A network that scores transforms trains on OUT
-    (configs/train/motions.yaml, --set data.train=OUT). Started again, it goes on. Exit code 2 when a shard
+    (configs/train/transforms.yaml, --set data.train=OUT). Started again, it goes on. Exit code 2 when a shard
     fails.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
@@ -338,5 +342,8 @@ def motions(context: click.Context, features: str, out: str, pairs: int, seed: i
         report = propose_motions(features, out, pairs, seed=seed, workers=workers, progress=advance)
     for line in report.failed:
         click.echo(f"failed: {line}", err=True)
-    click.echo(f"{report.made} shards made, {report.kept} kept, in {out}")
+    click.echo(f"{counted(report.made, 'shard')} made, {report.kept} kept, in {out}")
     context.exit(BAD_INPUT if report.failed else 0)
+
+
+renamed_verb(command, "motions", "transforms")

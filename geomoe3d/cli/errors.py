@@ -113,6 +113,17 @@ def renamed(old: str, new: str) -> Callable[[F], F]:
     return click.option(old, hidden=True, expose_value=False, is_flag=False, flag_value="", callback=refuse)
 
 
+def renamed_verb(group: click.Group, old: str, new: str) -> None:
+    """Gives a group the old name of a verb, whose use is an error that names the new one."""
+
+    @group.command(old, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})
+    @click.argument("words", nargs=-1, type=click.UNPROCESSED)
+    @click.pass_context
+    def refuse(context: click.Context, words: tuple[str, ...]) -> None:
+        room = context.command_path.removesuffix(old).split()[-1]
+        raise click.UsageError(f"'{room} {old}' is now '{room} {new}'", context.parent)
+
+
 def refuse_bare_settings(words: tuple[str, ...]) -> None:
     """Where settings were once given without ``--set``: an error that says how they are given now."""
     if words:

@@ -12,6 +12,7 @@ import click
 
 from geomoe3d.cli.errors import BAD_INPUT, HELP, command_line, traceback_option
 from geomoe3d.cli.parts import method_part_options
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.evaluation.score import ScoredRun
@@ -163,7 +164,7 @@ def compare(first: str, second: str) -> None:
     runs = [_score(Path(folder), raw=False) for folder in (first, second)]
     for folder, found in zip((first, second), runs, strict=True):
         if len(found) != 1:
-            raise InputError(f"'{folder}' holds {len(found)} runs; give the folder of one of them")
+            raise InputError(f"'{folder}' holds {counted(len(found), 'run')}; give the folder of one of them")
     a, b = (found[0].score for found in runs)
     click.echo(terminal_comparison(a, b, compare_scores(a, b)))
 

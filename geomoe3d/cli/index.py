@@ -11,6 +11,7 @@ import click
 from geomoe3d.cli.errors import HELP, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import configuration_options
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
@@ -81,7 +82,7 @@ def command(
     if not quiet:
         added = len(made.sources) - len(before)
         sizes = ", ".join(f"{size:.4g}" for size in made.voxel_sizes)
-        clouds = f"{len(made.sources)} cloud{'s' if len(made.sources) != 1 else ''}"
+        clouds = counted(len(made.sources), "cloud")
         click.echo(
-            f"{out}: {made.num_points:,} points of {clouds} ({added} new), indexed on a grid of {sizes}"
+            f"{out}: {counted(made.num_points, 'point')} of {clouds} ({added} new), indexed on a grid of {sizes}"
         )

@@ -11,6 +11,7 @@ from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, worker_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
@@ -154,14 +155,14 @@ def summary(model: SceneModel) -> str:
     color = "green" if model.ok else "yellow"
     kept = sum(edge.kept for edge in model.edges)
     lines = [
-        click.style(f"{placed} of {len(model.scans)} scans placed", fg=color, bold=True)
-        + f"; {model.num_pairs:,} pairs registered, {kept:,} edges kept; model in {model.folder}",
+        click.style(f"{placed} of {counted(len(model.scans), 'scan')} placed", fg=color, bold=True)
+        + f"; {counted(model.num_pairs, 'pair')} registered, {counted(kept, 'edge')} kept; model in {model.folder}",
     ]
     for number, group in enumerate(model.groups, start=1):
         closed = sum(loop.closes for loop in group.loops)
         lines.append(
-            f"  group {number}: {len(group.poses)} scans in the frame of '{group.reference}'; "
-            f"{closed} of {len(group.loops)} loops close"
+            f"  group {number}: {counted(len(group.poses), 'scan')} in the frame of '{group.reference}'; "
+            f"{closed} of {counted(len(group.loops), 'loop')} close"
         )
         if group.bent:
             lines.append(click.style(f"    {group.bent}", fg="yellow"))

@@ -12,6 +12,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
 from geomoe3d.cli.files import check_outputs
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.images.cameras import Camera
@@ -196,7 +197,9 @@ def _tell(
             rows = np.array2string(value, precision=6, suppress_small=True, prefix=" " * 4)
             click.echo(f"{name} = {rows}")
     middle = f", median residual {np.median(residuals[inliers]):.2f} pixels" if inliers.any() else ""
-    click.echo(f"{inliers.sum()} inliers of {len(matches)} matches{middle}")
+    click.echo(
+        f"{counted(int(inliers.sum()), 'inlier')} of {counted(len(matches), 'match', 'matches')}{middle}"
+    )
     if given["output"] is not None:
         plain = {
             name: np.asarray(value).tolist() if value is not None else None for name, value in answer.items()

@@ -9,6 +9,7 @@ import click
 
 from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.result import RegistrationResult
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import CloudReport, FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 
@@ -85,7 +86,7 @@ def _found(result: RegistrationResult, unit: str) -> list[str]:
 
 def _inliers(result: RegistrationResult, unit: str) -> str:
     return (
-        f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences within "
+        f"{result.num_inliers:,} of {counted(result.num_correspondences, 'correspondence')} within "
         f"{length(result.inlier_threshold, unit)}"
     )
 
@@ -97,19 +98,15 @@ def _chosen(result: RegistrationResult) -> str:
 
 def _cloud(cloud: CloudReport) -> str:
     dropped = [
-        f"{count:,} {what if count == 1 else several}"
-        for count, what, several in (
-            (
-                cloud.num_non_finite,
-                "point with NaN or infinite coordinates",
-                "points with NaN or infinite coordinates",
-            ),
-            (cloud.num_duplicates, "duplicate", "duplicates"),
-            (cloud.num_isolated, "isolated voxel", "isolated voxels"),
+        counted(count, what) + where
+        for count, what, where in (
+            (cloud.num_non_finite, "point", " with NaN or infinite coordinates"),
+            (cloud.num_duplicates, "duplicate", ""),
+            (cloud.num_isolated, "isolated voxel", ""),
         )
         if count
     ]
-    text = f"{cloud.name}: {cloud.num_input:,} points in"
+    text = f"{cloud.name}: {counted(cloud.num_input, 'point')} in"
     if not cloud.num_points:  # given up before any grid was chosen
         return text
     text += f", {cloud.num_points:,} voxel points used"

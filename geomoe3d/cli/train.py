@@ -17,6 +17,7 @@ from geomoe3d.cli.errors import (
     renamed,
     traceback_option,
 )
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.training.config import TrainConfig
@@ -87,7 +88,9 @@ def _train(settings: TrainConfig, folder: Path, new: bool, quiet: bool) -> int:
         click.echo(f"stopped at step {summary.step}; the same command goes on from there", err=True)
         return INTERRUPTED
     best = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in summary.best.items())
-    click.echo(f"{summary.step} steps, {summary.pairs_per_s:.1f} pairs/s, {summary.skipped} skipped")
+    click.echo(
+        f"{counted(summary.step, 'step')}, {summary.pairs_per_s:.1f} pairs/s, {summary.skipped} skipped"
+    )
     click.echo(f"best at step {summary.best_step}: {best}")
     click.echo(f"weights: {summary.weights}\ncurves:  {folder / 'curves.png'}")
     return 0

@@ -14,6 +14,7 @@ import numpy as np
 
 from geomoe3d.clouds.loading import load_points
 from geomoe3d.errors import InputError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, IntArray, PointCloud
 
 Mark = tuple[int, bytes]
@@ -76,7 +77,9 @@ class Inputs:
             cloud = load_points(data, seed=seed)
             if mark is not None and mark_of(cloud) != mark:
                 change = (
-                    f"has {len(cloud):,} points instead of {mark[0]:,}" if len(cloud) != mark[0] else "moved"
+                    f"has {counted(len(cloud), 'point')} instead of {mark[0]:,}"
+                    if len(cloud) != mark[0]
+                    else "moved"
                 )
                 raise InputError(
                     f"the {role} is no longer what was registered: it {change}; give it as it was: "

@@ -18,6 +18,7 @@ from geomoe3d.geometry.columns import bounds, extents, in_cache
 from geomoe3d.geometry.draws import OFF_ROUND, mixed
 from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.threads import each, usable_threads
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _MIN_POINTS = 3
@@ -58,7 +59,7 @@ def prepare(
     voxels = drop_isolated(voxels, radius)
     if len(voxels) < _MIN_POINTS:
         raise EmptyCloudError(
-            f"'{cloud.name}': {len(voxels)} of {len(cloud)} points remain on a {voxel_size:.4g} grid "
+            f"'{cloud.name}': {len(voxels)} of {counted(len(cloud), 'point')} remain on a {voxel_size:.4g} grid "
             f"({num_duplicates} duplicates, {num_voxels - len(voxels)} isolated), at least {_MIN_POINTS} are "
             f"needed; give a denser scan or a voxel size that fits it"
         )
@@ -124,7 +125,7 @@ def check_cloud(cloud: PointCloud) -> None:
         EmptyCloudError: fewer than 3 points, or all points equal.
     """
     if len(cloud) < _MIN_POINTS:
-        held = "1 point" if len(cloud) == 1 else f"{len(cloud)} points"
+        held = counted(len(cloud), "point")
         raise EmptyCloudError(f"'{cloud.name}' holds {held}; a rigid transform needs at least {_MIN_POINTS}")
     if not extents(cloud.points).any():
         raise EmptyCloudError(

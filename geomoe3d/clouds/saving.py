@@ -28,6 +28,7 @@ from geomoe3d.errors import FormatError, InputError, NonFiniteError
 from geomoe3d.geometry.se3 import scale_of
 from geomoe3d.runtime.files import check_output, write_atomically
 from geomoe3d.runtime.threads import usable_threads
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 WRITABLE_SUFFIXES = tuple(CLOUD_WRITERS)
@@ -104,7 +105,7 @@ def save_points(
         if extra is None:
             continue
         if len(extra) != len(cloud.points):
-            raise InputError(f"there are {len(cloud.points)} points but {len(extra)} {what}")
+            raise InputError(f"there are {counted(len(cloud.points), 'point')} but {len(extra)} {what}")
         bad = int(np.count_nonzero(~np.isfinite(extra).all(axis=1)))
         if bad:
             raise NonFiniteError(f"{bad} of {len(extra)} {what} hold NaN or infinities; remove them first")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.errors import FormatError, InputError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -141,8 +142,14 @@ def _of_rows(rows: list[list[float]], remarks: str) -> FloatArray:
         found = dict(zip(names, rows[0][-7:], strict=True))
         return _of_seven([found[name] for name in _SEVEN])
     if shape[0] > 1 and shape[1] in (7, 8, 12):
-        raise FormatError(f"{shape[0]} rows of {shape[1]} numbers; give a file of one transform")
-    what = f"numbers of shape {shape}" if shape[1] else f"{len(rows)} rows of {sum(map(len, rows))} numbers"
+        raise FormatError(
+            f"{counted(shape[0], 'row')} of {counted(shape[1], 'number')}; give a file of one transform"
+        )
+    what = (
+        f"numbers of shape {shape}"
+        if shape[1]
+        else f"{counted(len(rows), 'row')} of {counted(sum(map(len, rows)), 'number')}"
+    )
     raise FormatError(f"{what}; expected (4, 4), (3, 4), or translation and quaternion")
 
 
@@ -193,7 +200,7 @@ def _of_publisher(text: str) -> FloatArray:
                 numbers.append(float(word))
             if len(numbers) not in (6, 7):
                 raise FormatError(
-                    f"{len(numbers)} numbers behind static_transform_publisher, expected 6 or 7"
+                    f"{counted(len(numbers), 'number')} behind static_transform_publisher, expected 6 or 7"
                 )
             uses_angles, place, angles, turn = len(numbers) == 6, numbers[:3], numbers[3:6], numbers[3:]
     except ValueError as error:
@@ -213,7 +220,7 @@ def _of_document(data: Any) -> FloatArray:
         )  # of a failed result None, which becomes NaN
     found: list[FloatArray] = list(_motions(data))
     if len(found) != 1:
-        raise FormatError(f"{len(found)} motions in it, expected one")
+        raise FormatError(f"{len(found)} transforms in it, expected one")
     return found[0]
 
 

@@ -201,7 +201,7 @@ class CausesExpert(Section):
         0.028,
         "votes per match",
         (0, 1),
-        "of the best of a few motions, below which no mirrored source is looked at",
+        "of the best of a few transforms, below which no mirrored source is looked at",
         "0.012 to 0.028 by chance, and 0.036 to 0.15 of mirrored pairs that fit, among 31 recorded pairs",
     )
     mirrored_lead: float = constant(

@@ -95,6 +95,8 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         names = [str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml"))]
         close = difflib.get_close_matches(str(path), names, n=1, cutoff=0.75)
         hint = f"; did you mean {close[0]}, which comes with geomoe3d?" if close else ""
+        if Path(path).as_posix().endswith("train/motions.yaml"):
+            hint = "; it is now configs/train/transforms.yaml"
         raise MissingConfigError(f"cannot read configuration '{path}': {error.strerror}{hint}") from None
     except OSError as error:
         raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None

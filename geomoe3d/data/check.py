@@ -25,6 +25,7 @@ from geomoe3d.data.splits import (
     split_of,
 )
 from geomoe3d.errors import GeoMoE3DError
+from geomoe3d.runtime.words import counted
 
 
 @dataclass
@@ -123,7 +124,7 @@ def _find_missing(collection: Collection, report: CheckReport) -> None:
 def _count_scenes(collection: Collection, report: CheckReport) -> None:
     pairs = Counter((pair.scene, pair.group) for pair in collection.pairs)
     for scene, paths in collection.fragments.items():
-        counted = {group: pairs[scene, group] for group in report.num_pairs if pairs[scene, group]}
+        by_group = {group: pairs[scene, group] for group in report.num_pairs if pairs[scene, group]}
         official = collection.layout in ("benchmark", "evaluation")
         expected = TEST_FRAGMENTS.get(scene) if official else None
         report.scenes.append(
@@ -132,16 +133,18 @@ def _count_scenes(collection: Collection, report: CheckReport) -> None:
                 "split": split_of(scene),
                 "fragments": len(paths),
                 "published_fragments": expected,
-                "pairs": counted,
+                "pairs": by_group,
                 "published_pairs": TEST_PAIRS.get(scene) if official else None,
             }
         )
         if expected is not None and len(paths) != expected:
-            report.missing.append(f"scene '{scene}': {len(paths)} fragments, published are {expected}")
-        if official and scene in TEST_PAIRS and counted.get("3DMatch", 0) != TEST_PAIRS[scene]:
-            found = counted.get("3DMatch", 0)
             report.missing.append(
-                f"scene '{scene}': {found} pairs of 3DMatch, published are {TEST_PAIRS[scene]}"
+                f"scene '{scene}': {counted(len(paths), 'fragment')}, published are {expected}"
+            )
+        if official and scene in TEST_PAIRS and by_group.get("3DMatch", 0) != TEST_PAIRS[scene]:
+            found = by_group.get("3DMatch", 0)
+            report.missing.append(
+                f"scene '{scene}': {counted(found, 'pair')} of 3DMatch, published are {TEST_PAIRS[scene]}"
             )
     for group, count in report.num_pairs.items():
         wanted = PUBLISHED_PAIRS.get(group)

@@ -33,6 +33,7 @@ from geomoe3d.data.threedmatch import (
 )
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, MissingFileError
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, PointCloud
 
 _CLOUD_PATTERN = "cloud_bin_*.ply"
@@ -216,7 +217,9 @@ def _add_by_poses(collection: Collection, folder: Path) -> None:
         collection.problems.append(f"'{path}' holds no poses of 16 numbers: {error}")
         return
     if len(poses) != len(clouds) or not np.isfinite(poses).all():
-        collection.problems.append(f"'{path}' holds {len(poses)} finite poses for {len(clouds)} clouds")
+        collection.problems.append(
+            f"'{path}' holds {counted(len(poses), 'finite pose')} for {len(clouds)} clouds"
+        )
         return
     motions = [make_transform(project_to_so3(pose[:3, :3]), pose[:3, 3]) for pose in poses]
     for i, j in combinations(range(len(clouds)), 2):

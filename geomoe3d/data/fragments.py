@@ -18,6 +18,7 @@ from geomoe3d.data.rgbd import Frame, Recording, image_size, read_depth
 from geomoe3d.data.threedmatch import PairTable, write_gt_log, write_gt_overlap
 from geomoe3d.errors import GeoMoE3DError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import Float32Array, FloatArray
 
 OVERLAP_GRID = 0.025
@@ -94,7 +95,7 @@ def make_fragments(
             points = thin(points, grid)
         if len(points) < 100 or pose is None:
             report.skipped.append(
-                f"fragment of {run[0].path.name} to {run[-1].path.name}: {len(points)} points"
+                f"fragment of {run[0].path.name} to {run[-1].path.name}: {counted(len(points), 'point')}"
             )
         else:
             save_points(folder / f"cloud_bin_{len(clouds)}.ply", points.astype(np.float32))

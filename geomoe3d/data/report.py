@@ -11,6 +11,7 @@ import numpy as np
 from geomoe3d.data.statistics import BANDS
 from geomoe3d.data.synthesize import SynthesisReport
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.words import counted
 
 
 def report_text(report: SynthesisReport) -> str:
@@ -30,7 +31,7 @@ def report_text(report: SynthesisReport) -> str:
     ]
     for low, high in pairwise((0.0, *BANDS)):
         count = int(((overlaps >= low) & (overlaps < high)).sum())
-        lines.append(f"  - overlap {low:.0%} to {min(high, 1):.0%}: {count} pairs")
+        lines.append(f"  - overlap {low:.0%} to {min(high, 1):.0%}: {counted(count, 'pair')}")
     few = [str(scene.number) for scene in report.scenes if scene.num_pairs == 0]
     if few:
         lines.append(f"- scenes without a pair: {', '.join(few)}")
@@ -40,7 +41,7 @@ def report_text(report: SynthesisReport) -> str:
         new = [len(scene.num_points) for scene in report.scenes]
         each = report.cpu_seconds / max(1.0, sum(new) * report.made / len(new))
         lines.append(
-            f"- this run: {report.made} scenes made, {report.kept} kept, {report.seconds:.0f} s, "
+            f"- this run: {counted(report.made, 'scene')} made, {report.kept} kept, {report.seconds:.0f} s, "
             f"about {each:.2f} s of one core per fragment"
         )
     return "\n".join(lines) + "\n"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError, MissingFileError, cannot_read
 from geomoe3d.geometry.se3 import is_rotation, make_transform, project_to_so3
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import Float32Array, FloatArray
 
 CONVENTIONS = ("7scenes", "tum", "plain")
@@ -234,13 +235,13 @@ def _plain(folder: Path, skipped: list[str]) -> list[Frame]:
             rows = rows.reshape(-1, 16)
         else:
             raise FormatError(
-                f"'{folder / 'poses.txt'}' has {rows.shape[1]} columns, expected 16 or 12 per pose"
+                f"'{folder / 'poses.txt'}' has {counted(rows.shape[1], 'column')}, expected 16 or 12 per pose"
             )
     place = folder / "depth" if (folder / "depth").is_dir() else folder
     images = sorted(place.glob("*.png"))
     if len(images) != len(rows):
         raise FormatError(
-            f"'{folder}': {len(images)} depth images but {len(rows)} poses; one row each is needed"
+            f"'{folder}': {counted(len(images), 'depth image')} but {counted(len(rows), 'pose')}; each needs a row"
         )
     frames = []
     for path, row in zip(images, rows, strict=True):
@@ -259,7 +260,9 @@ def _tum(folder: Path, skipped: list[str]) -> list[Frame]:
 
     poses = _numbers(folder / "groundtruth.txt")
     if poses.shape[1] != 8:
-        raise FormatError(f"'{folder / 'groundtruth.txt'}' has {poses.shape[1]} columns, expected 8")
+        raise FormatError(
+            f"'{folder / 'groundtruth.txt'}' has {counted(poses.shape[1], 'column')}, expected 8"
+        )
     poses = poses[np.argsort(poses[:, 0])]
     frames = []
     for number, line in enumerate(_text(folder / "depth.txt").splitlines(), start=1):

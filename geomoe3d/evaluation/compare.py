@@ -14,6 +14,7 @@ import numpy as np
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.intervals import RESAMPLES, Interval, Quantity, Statistic, measure_all, quantile
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray
 
 
@@ -90,8 +91,8 @@ def compare(a: RunScore, b: RunScore, *, resamples: int = RESAMPLES, seed: int =
     both = [(score, of_b_by_id[score.pair]) for score in a.pairs if score.pair in of_b_by_id]
     if not both:
         raise InputError(
-            f"runs '{a.info.label}' ({len(a.pairs)} pairs) and '{b.info.label}' ({len(b.pairs)} pairs) have "
-            "no pair in common"
+            f"runs '{a.info.label}' ({counted(len(a.pairs), 'pair')}) and '{b.info.label}' "
+            f"({counted(len(b.pairs), 'pair')}) have no pair in common"
         )
     ids = [score.pair for score, _ in both]
     right_a = np.array([score.right for score, _ in both], dtype=np.bool_)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.evaluation.metrics import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
 from geomoe3d.evaluation.records import Measure, RunScore
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 NUM_COLORS = 8
@@ -206,7 +207,7 @@ def _recall_figure(name: str, runs: Sequence[tuple[int, RunScore]]) -> Figure | 
             [curve.measures[k].interval for k in bins],
             [
                 f"{label}: {_measure_words(curve.measures[k])}, {quantity} {edges[k]:g} to {edges[k + 1]:g}, "
-                f"{curve.measures[k].count:,} pairs"
+                + counted(curve.measures[k].count, "pair")
                 for k in bins
             ],
         )
@@ -274,7 +275,7 @@ def _confidence_figures(runs: Sequence[tuple[int, RunScore]]) -> list[Figure]:
             most = max((b.count for b in bins), default=1)
             tips = [
                 f"{label}: {100 * b.success:.1f} % right at mean confidence {b.confidence:.2f} "
-                f"({b.low:.2f} to {b.high:.2f}), {b.count} pairs"
+                f"({b.low:.2f} to {b.high:.2f}), {counted(b.count, 'pair')}"
                 for b in bins
             ]
             x, y = [b.confidence for b in bins], [100.0 * b.success for b in bins]

@@ -31,6 +31,7 @@ from geomoe3d.evaluation.report_words import benchmark_rank, recall_of, run_key,
 from geomoe3d.evaluation.summary import title
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.runtime.files import check_output, write_text
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import camera_fit, spacing_of, thin
 from geomoe3d.visual.templates import render_cloud_page
@@ -175,8 +176,7 @@ def _summary(groups: Groups) -> str:
     members = [score for group in groups.values() for score in group]
     num_answers = sum(len(score.pairs) for score in members)
     benchmarks = ", ".join(dict.fromkeys(benchmark for benchmark, _ in groups))
-    plural = "" if len(members) == 1 else "s"
-    return f"{len(members)} run{plural} on {benchmarks}; {num_answers:,} answers scored."
+    return f"{counted(len(members), 'run')} on {benchmarks}; {counted(num_answers, 'answer')} scored."
 
 
 # ---- the gallery of failures ----------------------------------------------------------------------
@@ -335,13 +335,15 @@ def _gallery_words(score: RunScore, shown: int) -> str:
         if not count:
             return f"Run {name} accepted none of {len(score.pairs):,} unrelated pairs."
         return (
-            f"Run {name} accepted {count:,} of {len(score.pairs):,} pairs whose scans have nothing in "
+            f"Run {name} accepted {count:,} of {counted(len(score.pairs), 'pair')} whose scans have nothing in "
             f"common; shown: the {shown:,} most confident."
         )
     count = sum(not pair.right for pair in score.pairs)
     if not count:
-        return f"Run {name} has no wrong answer among {len(score.pairs):,} pairs."
+        return f"Run {name} has no wrong answer among {counted(len(score.pairs), 'pair')}."
     order = "the most confident first, then by overlap"
     if all(pair.confidence is None for pair in score.pairs):
         order = "by overlap, as the run states no confidence"
-    return f"Run {name} is wrong on {count:,} of {len(score.pairs):,} pairs; shown: {shown:,}, {order}."
+    return (
+        f"Run {name} is wrong on {count:,} of {counted(len(score.pairs), 'pair')}; shown: {shown:,}, {order}."
+    )

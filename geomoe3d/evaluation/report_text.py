@@ -28,6 +28,7 @@ from geomoe3d.evaluation.report_words import (
     with_intervals,
 )
 from geomoe3d.evaluation.summary import title
+from geomoe3d.runtime.words import counted
 
 # ---- the terminal ---------------------------------------------------------------------------------
 
@@ -173,7 +174,7 @@ def _comparison_lines(found: Comparison) -> list[str]:
     lines = [
         f"## {a} against {b} on {found.a.benchmark}, track {found.a.track}",
         "",
-        f"{found.num_pairs:,} pairs answered by both; {found.num_only_in_a:,} by {a} only, "
+        f"{counted(found.num_pairs, 'pair')} answered by both; {found.num_only_in_a:,} by {a} only, "
         f"{found.num_only_in_b:,} by {b} only.",
         "",
         *(f"- {_plain(note)}\n" for note in found.notes),

@@ -10,6 +10,7 @@ from geomoe3d.data.threedmatch import BENCHMARKS
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
+from geomoe3d.runtime.words import counted
 
 COLUMNS = {
     "recall_15": "recall\n15/0.30",
@@ -43,14 +44,14 @@ def warnings(run: RunScore) -> list[str]:
     found = []
     if run.num_missing:
         found.append(
-            f"'{run.info.label}' has not answered {run.num_missing:,} of {run.num_pairs:,} pairs; its "
+            f"'{run.info.label}' has not answered {run.num_missing:,} of {counted(run.num_pairs, 'pair')}; its "
             f"numbers are over the other {run.num_pairs - run.num_missing:,} and not those of the benchmark"
         )
     errors = [score.error for score in run.pairs if score.error is not None]
     if errors:
         first = " ".join(errors[0].split())
         found.append(
-            f"'{run.info.label}' ended with an error on {len(errors):,} of {len(run.pairs):,} pairs; they "
+            f"'{run.info.label}' ended with an error on {len(errors):,} of {counted(len(run.pairs), 'pair')}; they "
             f"count as not right; the first: {first[:_LONGEST_ERROR]}{'...' * (len(first) > _LONGEST_ERROR)}"
         )
     if run.raw_truth:
@@ -83,7 +84,11 @@ def thinning(info: RunInfo) -> int:
 
 def pairs_text(run: RunScore) -> str:
     """How many pairs the run is over, and whether these are a share of the benchmark only."""
-    text = f"{len(run.pairs):,} of {run.num_pairs:,} pairs" if run.num_missing else f"{run.num_pairs:,} pairs"
+    text = (
+        f"{len(run.pairs):,} of {counted(run.num_pairs, 'pair')}"
+        if run.num_missing
+        else counted(run.num_pairs, "pair")
+    )
     every = thinning(run.info)
     return text + (f", 1 in {every} of the benchmark" if every > 1 else "")
 

@@ -27,6 +27,7 @@ from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
 from geomoe3d.images.scenes import choose_pairs, images_in, read_scene
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray
 
 POSE_LIMITS, CORNER_LIMITS = (5.0, 10.0, 20.0), (3.0, 5.0, 10.0)
@@ -308,7 +309,8 @@ def _area(
 def to_markdown(table: dict[str, dict[str, Measure]], num: int) -> str:
     """A table of the summary: value, interval over pairs, interval over scenes."""
     columns = [what for what in next(iter(table.values())) if not what.startswith("gain")]
-    lines = [f"{num} pairs; 95 % intervals over pairs, then over scenes; gain: against '{BASELINE}' on the same pairs.",
+    lines = [f"{counted(num, 'pair')}; 95 % intervals over pairs, then over scenes; "
+             f"gain: against '{BASELINE}' on the same pairs.",
              "", "| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]  # fmt: skip
     lines += [
         f"| {name} | " + " | ".join(f"{row[c].value:.2f}" for c in columns) + " |"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError
 from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
@@ -63,7 +64,7 @@ def save_matches(
     grid = figure.add_gridspec(2, len(shown))
     axes = figure.add_subplot(grid[0, :])
     axes.imshow(both, cmap="gray", vmin=0, vmax=255)
-    axes.set_title(title or f"{kept.sum():,} of {len(kept):,} matches kept")
+    axes.set_title(title or f"{kept.sum():,} of {counted(len(kept), 'match', 'matches')} kept")
     rng = np.random.default_rng(0)
     for rows, color, width in (
         (np.flatnonzero(~kept), "#d1495b", 0.3),

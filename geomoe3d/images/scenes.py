@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from geomoe3d.errors import FormatError, InputError, MissingFileError
 from geomoe3d.geometry.se3 import inverse, make_transform
 from geomoe3d.images.cameras import Camera, ImageScene, View, rotation_deg
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".tif", ".tiff")
@@ -128,7 +129,7 @@ def _llff(folder: Path, file: Path) -> Iterator[View]:
     images = sorted(images_in(folder / "images"))  # 10 before 2, as LLFF counts
     if len(images) != len(rows):
         raise InputError(
-            f"'{file}' has {len(rows)} poses, but '{folder / 'images'}' has {len(images)} images"
+            f"'{file}' has {counted(len(rows), 'pose')}, but '{folder / 'images'}' has {counted(len(images), 'image')}"
         )
     for path, row in zip(images, rows, strict=True):
         given = row[:15].reshape(3, 5)

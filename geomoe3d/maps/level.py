@@ -23,6 +23,7 @@ from geomoe3d.features.learned import LearnedDescriptor
 from geomoe3d.features.pyramid import one_per_voxel, pyramid
 from geomoe3d.maps.facing import both_sides, facing_alike
 from geomoe3d.maps.voxels import VoxelSums
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, Float32Array, FloatArray, IntArray, PreparedCloud
 
 if TYPE_CHECKING:
@@ -87,8 +88,8 @@ class Level:
         points = drop_isolated(points, radius)
         if len(points) < (least := expert().maps.least_points):
             raise EmptyCloudError(
-                f"'{name}': {len(points)} points remain on a {voxel_size:.4g} grid, at least {least} are needed; "
-                "give a denser cloud or a voxel size that fits it"
+                f"'{name}': {counted(len(points), 'point')} left on a {voxel_size:.4g} grid, at least {least} are "
+                "needed; give a denser cloud or a voxel size that fits it"
             )
         normals = estimate_normals(points, radius, config.normal_neighbors)
         normals, known = _turned(points, normals, voxels)

@@ -21,6 +21,7 @@ from geomoe3d.config import expert
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import check_motion, inverse, shift_frames
 from geomoe3d.multiway.edges import Edge, Shape
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 
@@ -76,7 +77,9 @@ def read_poses(path: str | os.PathLike[str], names: Sequence[str]) -> tuple[Floa
     try:
         found = _of_json(json.loads(text), names) if text.lstrip()[:1] in "[{" else _of_text(text)
         if len(found) != len(names):
-            raise InputError(f"{len(found)} poses for {len(names)} scans; give one per scan, in their order")
+            raise InputError(
+                f"{counted(len(found), 'pose')} for {counted(len(names), 'scan')}; give one per scan, in their order"
+            )
         return tuple(check_motion(T) for T in found)
     except KeyError as error:
         raise InputError(f"initial poses '{path}': the key {error} is missing") from None

@@ -29,6 +29,7 @@ from geomoe3d.multiway.tables import (
     scans_text,
 )
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 MATRICES_FOLDER = "matrices"
@@ -113,8 +114,8 @@ class SceneGroup:
             return ""
         worst = open_loops[0]
         return (
-            f"{len(open_loops)} of {len(self.loops)} loops do not close: going round by "
-            f"'{worst.scans[0]}' and '{worst.scans[-1]}' ({len(worst.scans)} scans) ends {worst.shift:.3g} "
+            f"{len(open_loops)} of {counted(len(self.loops), 'loop')} do not close: going round by "
+            f"'{worst.scans[0]}' and '{worst.scans[-1]}' ({counted(len(worst.scans), 'scan')}) ends {worst.shift:.3g} "
             f"and {worst.turn_deg:.1f} deg off; the group may be bent there"
         )
 

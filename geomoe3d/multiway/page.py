@@ -17,6 +17,7 @@ from geomoe3d.clouds.io import load_points
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import thin
 from geomoe3d.visual.templates import base64_floats, render_cloud_page
@@ -62,7 +63,7 @@ def render_model_page(model: SceneModel) -> str:
     doubtful = [edge for edge in model.edges if not edge.kept and edge.confidence > 0.5]
     values = {
         "generator": Markup(PAGE_MARK),
-        "title": f"{placed} of {len(model.scans)} scans placed",
+        "title": f"{placed} of {counted(len(model.scans), 'scan')} placed",
         "summary": _summary(model, placed),
         "groups": model.groups,
         "colors": colors,
@@ -126,8 +127,8 @@ def _summary(model: SceneModel, placed: int) -> str:
     kept = sum(edge.kept for edge in model.edges)
     groups = f" in {len(model.groups)} groups that nothing sure connects" if len(model.groups) > 1 else ""
     return (
-        f"{placed} of {len(model.scans)} scans placed{groups}. {model.num_pairs} pairs registered, {kept} "
-        f"edges kept. Common voxel size {model.voxel_size:.4g}."
+        f"{placed} of {counted(len(model.scans), 'scan')} placed{groups}. {counted(model.num_pairs, 'pair')} "
+        f"registered, {counted(kept, 'edge')} kept. Common voxel size {model.voxel_size:.4g}."
     )
 
 

@@ -15,6 +15,7 @@ from geomoe3d.multiway.pose_graph import spanning_tree
 from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import is_kept
 from geomoe3d.multiway.survey import Survey
+from geomoe3d.runtime.words import counted
 
 
 def describe_model(survey: Survey, edges: Sequence[Edge], folder: Path, groups: list[Group]) -> SceneModel:
@@ -101,10 +102,10 @@ def _why_unplaced(survey: Survey, edges: Sequence[Edge], scan: int) -> str:
     mine = [edge for edge in edges if scan in (edge.source, edge.target)]
     tried = sum(scan in pair for pair in survey.outcomes)
     if not mine:
-        return f"none of its {tried} pairs gave a transform"
+        return f"none of its {counted(tried, 'pair')} gave a transform"
     edge = max(mine, key=lambda edge: edge.confidence)
     other = survey.scans[edge.source if edge.target == scan else edge.target].name
-    surest = f"its surest of {tried} pairs, with '{other}', has confidence {edge.confidence:.3f}"
+    surest = f"its surest of {counted(tried, 'pair')}, with '{other}', has confidence {edge.confidence:.3f}"
     voices = sum(edge.worth > survey.rules.least_worth for edge in mine)
     if voices > 1:
         return f"{surest}, but its {voices} likely pairs do not agree on one place clearly enough"

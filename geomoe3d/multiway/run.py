@@ -34,6 +34,7 @@ from geomoe3d.multiway.survey import Survey
 from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.timing import StageClock
+from geomoe3d.runtime.words import counted
 
 _ONCE = {"descriptor": "none", "grids": (), "max_correspondences": 0}  # no second look
 
@@ -166,7 +167,9 @@ def register_scans(
         maps = survey.map_pairs(groups, assembly.edges)
         if not maps:
             break
-        clock(f"local maps, round {count + 1} of at most {most}: register {len(maps)} pairs of them")
+        clock(
+            f"local maps, round {count + 1} of at most {most}: register {counted(len(maps), 'pair')} of them"
+        )
         survey.register_maps(maps, groups)
         clock("group scans")
         known, groups = groups, assembly.groups()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from geomoe3d import __version__
+from geomoe3d.runtime.words import counted
 
 
 def source_commit() -> str:
@@ -36,7 +37,7 @@ def hardware() -> str:
     except OSError:
         pass
     cores = usable_cores()
-    text = f"{model}, {cores} core{'s' if cores != 1 else ''}"
+    text = f"{model}, {counted(cores, 'core')}"
     try:
         size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (ValueError, OSError, AttributeError):

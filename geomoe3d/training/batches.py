@@ -167,7 +167,7 @@ def choose_motions(
         raise InputError(
             "consensus proposed no transform to score; leave such pairs out"
             if pair.motions is not None
-            else "no transforms to score; make the data with 'geomoe3d data motions'"
+            else "no transforms to score; make the data with 'geomoe3d data transforms'"
         )
     T = pair.T_target_source
     right = np.array(

@@ -109,7 +109,7 @@ class TrainConfig(Section):
         if self.network.judges_motions and (given.rotate or given.swap or given.jitter):
             raise ValueError(
                 "a network that scores transforms is trained with data.augmentation.rotate=false, swap=0 and "
-                "jitter=0: its channels do not change with rotation, and the others would not fit the motions"
+                "jitter=0: its channels do not change with rotation, and the others would not fit the transforms"
             )
         if (
             self.network.correspondence_dim == 4

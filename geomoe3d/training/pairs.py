@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, Float32Array, FloatArray
 
 OPTIONAL_CHANNELS = ("feature_distance", "ratio", "mutual")
@@ -204,7 +205,7 @@ def write_shard(path: str | Path, pairs: Sequence[TrainingPair]) -> None:
     for name in (*OPTIONAL_CHANNELS, "motions", "viewpoints"):
         given = [values for p in pairs if (values := getattr(p, name)) is not None]
         if given and len(given) < len(pairs):
-            raise InputError(f"{len(given)} of {len(pairs)} pairs have '{name}'; all or none must")
+            raise InputError(f"{len(given)} of {counted(len(pairs), 'pair')} have '{name}'; all or none must")
         if given:
             arrays[name] = np.stack(given) if name == "viewpoints" else np.concatenate(given)
         if given and name == "motions":

@@ -25,6 +25,7 @@ from geomoe3d.networks.pretrained import load_network, save_pretrained
 from geomoe3d.networks.weight_files import WeightCard
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.provenance import source_commit
+from geomoe3d.runtime.words import counted
 from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples
 from geomoe3d.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from geomoe3d.training.config import TrainConfig
@@ -227,8 +228,8 @@ class TrainingRun:
         check_same_run(state, self.config, self.pairs.identity(), self.last_path)
         if (world := state.get("world", self.process.world)) != self.process.world:
             raise CheckpointError(
-                f"'{self.last_path}' was trained by {world} processes, now {self.process.world}: each step "
-                f"would see another number of pairs; start as many as before"
+                f"'{self.last_path}' was trained by {counted(world, 'process', 'processes')}, now "
+                f"{self.process.world}: each step would see another number of pairs; start as many as before"
             )
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])

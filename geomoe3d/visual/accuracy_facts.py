@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geomoe3d.runtime.words import counted
+
 if TYPE_CHECKING:
     from geomoe3d.result import RegistrationResult
 
@@ -77,7 +79,7 @@ def paragraph(result: RegistrationResult) -> str:
     overlap = result.overlap if result.accuracy is None else result.accuracy.overlap_source
     words += (
         f"; {overlap:.0%} of the source lies on the target, {result.num_inliers:,} of "
-        f"{result.num_correspondences:,} correspondences agree within {result.inlier_threshold:.3g}"
+        f"{counted(result.num_correspondences, 'correspondence')} agree within {result.inlier_threshold:.3g}"
     )
     if result.ok and (found := result.accuracy) is not None:
         words += (

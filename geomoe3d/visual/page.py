@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import check_output, write_text
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, IntArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 from geomoe3d.visual.drawing import (
@@ -198,7 +199,10 @@ def _facts(view: RegistrationView) -> list[tuple[str, str]]:
     share = f" ({result.num_inliers / result.num_correspondences:.1%})" if result.num_correspondences else ""
     return [
         *accuracy_facts(result, view.unit),
-        ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences{share}"),
+        (
+            "inliers",
+            f"{result.num_inliers:,} of {counted(result.num_correspondences, 'correspondence')}{share}",
+        ),
         ("inlier threshold", length(result.inlier_threshold, view.unit)),
         ("voxel size", length(result.voxel_size, view.unit)),
         ("source points", f"{len(view.source_points):,}"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 from geomoe3d.visual.drawing import (
@@ -175,7 +176,7 @@ def draw_facts(axes: Axes, view: RegistrationView) -> None:
         ("status", STATUS_WORDS[result.status]),
         ("confidence", number(result.confidence, ".2f")),
         *((name, textwrap.fill(text.split(" (")[0], 38)) for name, text in accuracy_facts(result, view.unit)),
-        ("inliers", f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences"),
+        ("inliers", f"{result.num_inliers:,} of {counted(result.num_correspondences, 'correspondence')}"),
         ("voxel size", length(result.voxel_size, view.unit, ".4g")),
     ]
     if result.seconds:

@@ -17,6 +17,7 @@ import numpy as np
 from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.accuracy_facts import length
 from geomoe3d.visual.drawing import (
@@ -147,7 +148,7 @@ def _draw_header(figure: Figure, view: RegistrationView) -> None:
         figure.text(
             x + 0.016,
             0.938,
-            f"{role}  {shorten(name, 44)}   ({num:,} points)",
+            f"{role}  {shorten(name, 44)}   ({counted(num, 'point')})",
             fontsize=12.5,
             color=INK,
             va="center",

@@ -15,6 +15,7 @@ import numpy as np
 
 from geomoe3d.clouds.transform_files import check_suffix
 from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 from geomoe3d.visual.drawing import (
@@ -161,7 +162,7 @@ def _scans(view: RegistrationView) -> list[tuple[str, str, str]]:
     return [
         (
             role,
-            f"{shorten(cloud.name, 60)}: {cloud.num_input:,} points, {cloud.num_points:,} used on the grid",
+            f"{shorten(cloud.name, 60)}: {counted(cloud.num_input, 'point')}, {cloud.num_points:,} used on the grid",
             color,
         )
         for role, cloud, color in (
@@ -175,7 +176,7 @@ def _measured(view: RegistrationView) -> list[tuple[str, str, str]]:
     result = view.result
     facts = accuracy_facts(result, view.unit)
     if result.num_correspondences:
-        agree = f"{result.num_inliers:,} of {result.num_correspondences:,} correspondences within "
+        agree = f"{result.num_inliers:,} of {counted(result.num_correspondences, 'correspondence')} within "
         facts.append(("inliers", agree + length(result.inlier_threshold, view.unit, ".4g")))
     if np.isfinite(result.voxel_size):
         facts.append(("grid", f"voxels of {length(result.voxel_size, view.unit, '.4g')}"))

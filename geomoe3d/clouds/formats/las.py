@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors, wrong_count
 from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import DependencyError, FormatError, InputError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 _POINTS_PER_BYTE = 100  # far more than any compression gives, of points that differ
@@ -201,8 +202,8 @@ def _check_chunk_table(path: Path, header: Any, size: int) -> None:
         )
     if 0 < chunk_points < 0xFFFFFFFF and -(-header.point_count // chunk_points) != num_chunks:
         raise FormatError(
-            f"'{path}': the header says {header.point_count} points, the file holds {num_chunks} chunks of "
-            f"at most {chunk_points}; its header is wrong"
+            f"'{path}': the header says {header.point_count} points, the file holds "
+            f"{counted(num_chunks, 'chunk')} of at most {chunk_points}; its header is wrong"
         )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from geomoe3d.clouds.formats.raw import RawCloud, cloud_of
 from geomoe3d.clouds.formats.registry import reader
 from geomoe3d.errors import FormatError
+from geomoe3d.runtime.words import counted
 
 _NAMES = ("x", "y", "z", "intensity", "ring")
 _FARTHEST = 1e4  # m; no such sensor reaches it, and bits that are no floats do
@@ -44,7 +45,7 @@ def read_bin(path: Path) -> RawCloud:
         possible = possible[1:]  # whole numbers all the way down are no chance
     if len(possible) != 1:
         raise FormatError(
-            f"'{path}' holds {len(values)} bytes, which are "
+            f"'{path}' holds {counted(len(values), 'byte')}: "
             f"{'as well' if possible else 'neither'} rows of 4 floats (x y z intensity, as of KITTI) "
             f"{'as' if possible else 'nor'} of 5 (and a ring, as of nuScenes); save it as .npy, shape (N, 3)"
         )

@@ -25,6 +25,7 @@ from geomoe3d.clouds.formats.text import write_rows
 from geomoe3d.clouds.recentre import choose_origin, fits_single_precision
 from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import make_transform, scale_of, transform_points
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 
@@ -137,7 +138,7 @@ def _stl_size(path: Path) -> int | None:
     held = max(0, size - 84) // 50
     if said < 0 or held < said:
         raise FormatError(
-            f"'{path}': the header says {max(said, 0)} faces, the file holds {held}; "
+            f"'{path}': the header says {counted(max(said, 0), 'face')}, the file holds {held}; "
             "it is truncated or no STL"
         )
     return 84 + 50 * int(said)
@@ -156,7 +157,8 @@ def _check_off(path: Path) -> None:
     said, held = int(counts[0]) + int(counts[1]), len(rows) - first
     if said > held:
         raise FormatError(
-            f"'{path}': the header says {counts[0]} vertices and {counts[1]} faces, that is {said} lines; "
+            f"'{path}': the header says {counted(int(counts[0]), 'vertex', 'vertices')} and "
+            f"{counted(int(counts[1]), 'face')}, that is {counted(said, 'line')}; "
             f"the file holds {held}; it is truncated or its header is wrong"
         )
 
@@ -183,7 +185,7 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
         )
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise FormatError(
-                f"{what}: a face names vertex {faces.max()}, there are {len(vertices)} vertices"
+                f"{what}: a face names vertex {faces.max()}, there are {counted(len(vertices), 'vertex', 'vertices')}"
             )
         parts.append(RawCloud(vertices, None, _vertex_colors(item), faces))
         kind = str(getattr(item.visual, "kind", None))
@@ -248,7 +250,9 @@ def sample_surface(mesh: RawCloud, num_points: int, seed: int, what: str) -> Flo
     origin = choose_origin(mesh.points)  # areas of small triangles far from zero would drown in rounding
     body = trimesh.Trimesh(mesh.points - origin, mesh.faces, process=False)
     if not body.area > 0:
-        raise InputError(f"{what}: all {_num_faces(mesh)} faces of the mesh are degenerate (area 0)")
+        raise InputError(
+            f"{what}: all {counted(_num_faces(mesh), 'face')} of the mesh are degenerate (area 0)"
+        )
     points = trimesh.sample.sample_surface(body, num_points, seed=seed)[0]
     return np.asarray(points, dtype=np.float64) + origin
 

@@ -29,6 +29,7 @@ from geomoe3d.clouds.formats.raw import (
 from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.clouds.formats.text import parse_numbers
 from geomoe3d.errors import FormatError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import IntArray
 
 _TYPES = {
@@ -100,10 +101,12 @@ def read_ply(path: Path) -> RawCloud:
             unread.append(f"element {element.name}")
     rest = body[place:]
     if order == "=" and len(rest):
-        raise FormatError(f"'{path}' holds {len(rest) // 8} numbers more than its header describes")
+        raise FormatError(
+            f"'{path}' holds {counted(len(rest) // 8, 'number')} more than its header describes"
+        )
     if rest[:64].tobytes().strip(b"\0\r\n\t "):
         raise FormatError(
-            f"'{path}' holds {len(body)} bytes behind its header, its header describes {place}; the counts "
+            f"'{path}' holds {counted(len(body), 'byte')} behind its header, its header describes {place}; the counts "
             "in it are wrong"
         )
     return cloud_of(scalars, columns, faces=_checked_faces(faces, vertex.count, path), unread=tuple(unread))
@@ -286,7 +289,8 @@ def _checked_faces(faces: IntArray | None, num_points: int, path: Path) -> IntAr
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= num_points:
         raise FormatError(
-            f"'{path}': a face names vertex {low if low < 0 else high}, the file holds {num_points} vertices"
+            f"'{path}': a face names vertex {low if low < 0 else high}, the file holds "
+            f"{counted(num_points, 'vertex', 'vertices')}"
         )
     return faces
 

@@ -12,6 +12,7 @@ from geomoe3d.clouds.formats.registry import reader
 from geomoe3d.clouds.formats.text import DataLines, parse_table
 from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 _NAMES = {
@@ -51,7 +52,7 @@ def read_ptx(path: Path) -> RawCloud:
             tables.append(table)
     width = min((table.shape[1] for table in tables), default=3)
     if width not in _NAMES:
-        raise FormatError(f"'{path}': its points have {width} columns, expected 3, 4 or 7")
+        raise FormatError(f"'{path}': its points have {counted(width, 'column')}, expected 3, 4 or 7")
     whole = np.concatenate([table[:, :width] for table in tables])
     lost = "colours or intensity of some scans"
     some = any(table.shape[1] != width for table in tables)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, header_count, split_columns, wrong_count
 from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import FormatError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 _COMMENTS = ("#", "//")
@@ -123,7 +124,7 @@ def parse_table(
         return np.empty((0, width if columns is None else len(columns)))
     found = len(first.split(delimiter))
     if found != width:
-        raise FormatError(f"{lines.where(path)} has {found} columns, expected {width}")
+        raise FormatError(f"{lines.where(path)} has {counted(found, 'column')}, expected {width}")
     try:
         table: FloatArray = np.loadtxt(
             chain([first], lines),
@@ -135,7 +136,9 @@ def parse_table(
         )
     except ValueError:
         found = len(lines.text.split(delimiter))
-        problem = f"has {found} columns, expected {width}" if found != width else "is not all numbers"
+        problem = (
+            f"has {counted(found, 'column')}, expected {width}" if found != width else "is not all numbers"
+        )
         raise FormatError(f"{lines.where(path)} {problem}") from None
     return table
 
@@ -220,14 +223,16 @@ def _read_table(path: Path, handle: IO[str], odd: bool) -> RawCloud:
     else:
         return RawCloud(np.empty((0, 3)))
     if len(tokens) < 3:
-        raise FormatError(f"{lines.where(path)} has {len(tokens)} columns, a point needs at least 3")
+        raise FormatError(
+            f"{lines.where(path)} has {counted(len(tokens), 'column')}, a point needs at least 3"
+        )
     if header is None and remark is not None and len(remark) == len(tokens):
         header = remark
     if header is None and counts:
         header = _COUNTED.get(len(tokens))
     if header is not None and len(header) != len(tokens):
         raise FormatError(
-            f"{lines.where(path)} has {len(tokens)} columns but the header names {len(header)}: "
+            f"{lines.where(path)} has {counted(len(tokens), 'column')} but the header names {len(header)}: "
             f"{' '.join(header)}"
         )
     words = [k for k, token in enumerate(tokens) if not _is_number(token)] if header is not None else []

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
 from geomoe3d.decision.scale import Scale, measure_scale
 from geomoe3d.decision.selection import Selection
+from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
@@ -44,16 +45,14 @@ class Look(NamedTuple):
     weighed: FilterOutput
     decision: Decision
 
-    def scale(self) -> Scale | None:
+    def scale(self, shared: SharedSurface) -> Scale | None:
         """See `measure_scale`."""
-        return measure_scale(self.decision.T_target_source, *self.pair.clouds)
+        return measure_scale(self.decision.T_target_source, shared)
 
-    def accuracy(self) -> Accuracy | None:
+    def accuracy(self, shared: SharedSurface) -> Accuracy | None:
         """See `measure_accuracy`."""
         pair = self.pair
-        return measure_accuracy(
-            self.decision.T_target_source, *pair.clouds, pair.matched, pair.inlier_threshold
-        )
+        return measure_accuracy(self.decision.T_target_source, shared, pair.matched, pair.inlier_threshold)
 
 
 @dataclass
@@ -110,12 +109,15 @@ class Line:
         prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock, sides)
         look = self._best(clouds, prepared, places, sides)
         clock("decide")
+        shared = SharedSurface(*look.pair.clouds)
         if look.decision.answer is not None:
-            look = look._replace(decision=self._made_parallel(look.pair, look.decision))
+            with single_blas_thread():
+                look = look._replace(decision=self._made_parallel(look, shared))
         decision, agreeing = look.decision, self._mirrored_agreement(prepared, places)
         asks_mirrored = config.second_look.mirror and self.again is not None
         # None of these needs the others, so they are had side by side.
-        tasks: list[Callable[[], Any]] = [] if decision.answer is None else [look.scale, look.accuracy]
+        asked = () if decision.answer is None else (look.scale, look.accuracy)
+        tasks: list[Callable[[], Any]] = [partial(measure, shared) for measure in asked]
         if asks_mirrored and not is_sure(decision.judgement):
             tasks.append(agreeing)
         with single_blas_thread():
@@ -196,11 +198,13 @@ class Line:
         matched = None if given is None else between_clouds(given, prepared)
         pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
         weighed, proposed = line.propose(pair, clock)
+        polish = line.refiner.about(pair)  # whatever matches: the clouds stay the same
 
         def select(pair: Pair, proposed: list[Hypothesis], again: bool = False) -> Selection:
             config = stricter if again else self.config
             choosing = line.second_scorers if again else {}
-            selection = Selection(pair, line.scorers, line.refiner, config, clock, choosing)
+            refine = polish if line.refiner.needs_clouds else line.refiner.about(pair)
+            selection = Selection(pair, line.scorers, refine, config, clock, choosing)
             selection.add(proposed)
             if rivals is not None:
                 selection.add(rivals.transforms())
@@ -265,7 +269,7 @@ class Line:
         """The result of a look, with what led to it."""
         pair, weighed, decision = look
         if decision.answer is not None and decision.accuracy is None:
-            decision = replace(decision, accuracy=look.accuracy())
+            decision = replace(decision, accuracy=look.accuracy(SharedSurface(*pair.clouds)))
         if NETWORK in self.pipeline.scorers:
             opinion = opinion_of(decision.answer)
             said = None if opinion is None else opinion.output
@@ -274,11 +278,11 @@ class Line:
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
-    def _made_parallel(self, pair: Pair, decision: Decision) -> Decision:
-        wanted = self.config.refinement
+    def _made_parallel(self, look: Look, shared: SharedSurface) -> Decision:
+        decision, wanted = look.decision, self.config.refinement
         if not wanted.parallel or wanted.name not in ("gicp", "icp"):
             return decision
-        return decision.moved(made_parallel(decision.T_target_source, *pair.clouds, pair.inlier_threshold))
+        return decision.moved(made_parallel(decision.T_target_source, shared, look.pair.inlier_threshold))
 
     def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
         return None if self.again is None else differing_units(clouds, self.again, self.clock)

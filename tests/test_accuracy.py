@@ -16,6 +16,7 @@ from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.clouds.saving import save_aligned
 from geomoe3d.decision.accuracy import measure_accuracy
+from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.result import RegistrationResult
@@ -38,7 +39,7 @@ def measured(source: FloatArray, target: FloatArray, T: FloatArray) -> Accuracy:
     rows = Correspondences(
         np.hstack([source[:50], transform_points(T, source[:50]) + np.array([0.03, 0.04, 0])])
     )
-    found = measure_accuracy(T, prepared(source), prepared(target), rows, 2 * VOXEL)
+    found = measure_accuracy(T, SharedSurface(prepared(source), prepared(target)), rows, 2 * VOXEL)
     assert found is not None
     return found
 
@@ -96,7 +97,7 @@ def test_deviations_scale_with_the_unit_and_not_with_the_frame() -> None:
     large = T.copy()
     large[:3, 3] *= 1000
     both = (prepared(1000 * points, 1000 * VOXEL) for points in (source, target))
-    other = measure_accuracy(large, *both, rows, 2000 * VOXEL)
+    other = measure_accuracy(large, SharedSurface(*both), rows, 2000 * VOXEL)
     assert other is not None and np.isnan(other.inlier_rmse)
     assert other.sigma_center == pytest.approx(1000 * one.sigma_center, rel=0.01)
     assert other.sigma_rotation_deg == pytest.approx(one.sigma_rotation_deg, rel=0.01)
@@ -109,7 +110,7 @@ def test_nothing_is_said_where_next_to_nothing_lies_on_each_other() -> None:
     away = T.copy()
     away[0, 3] += 100
     nothing = measure_accuracy(
-        away, prepared(source), prepared(target), Correspondences(np.zeros((0, 6))), 0.2
+        away, SharedSurface(prepared(source), prepared(target)), Correspondences(np.zeros((0, 6))), 0.2
     )
     assert nothing is None
 

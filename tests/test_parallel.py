@@ -7,6 +7,7 @@ import pytest
 from surface_pairs import motion, pair, perturbation, prepared, surfaces
 
 from geomoe3d.decision.parallel import made_parallel, main_directions, with_right_angles
+from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
 
 VOXEL = 0.1
@@ -58,7 +59,7 @@ def test_a_loose_answer_is_made_parallel() -> None:
     middle = transform_points(T, np.array([[4.5, 1.5, 0.0]]))[0] - clouds[1].origin
     for turn in np.radians(6) * np.eye(3):
         start = perturbation(T[:3, :3] @ turn, np.zeros(3), middle) @ truth
-        found = made_parallel(start, *clouds, 2 * VOXEL)
+        found = made_parallel(start, SharedSurface(*clouds), 2 * VOXEL)
         assert rotation_error_deg(start, truth) == pytest.approx(6, abs=1e-6)
         assert rotation_error_deg(found, truth) < 2.5
 
@@ -67,10 +68,10 @@ def test_a_firm_answer_stays_whatever_is_askew() -> None:
     source, target, T = pair()
     shift = T.copy()
     shift[:3, 3] += T[:3, :3] @ source.origin - target.origin
-    assert rotation_error_deg(made_parallel(shift, source, target, 2 * VOXEL), shift) < 0.01
+    assert rotation_error_deg(made_parallel(shift, SharedSurface(source, target), 2 * VOXEL), shift) < 0.01
     source, target, T = pair("cylinder")  # its sides face everywhere, and none of them is a wall
     T[:3, 3] += T[:3, :3] @ source.origin - target.origin
-    assert rotation_error_deg(made_parallel(T, source, target, 2 * VOXEL), T) < 0.1
+    assert rotation_error_deg(made_parallel(T, SharedSurface(source, target), 2 * VOXEL), T) < 0.1
     source, target, T = pair()
     # A second floor, askew by ten degrees, that the source alone saw.
     askew = transform_points(
@@ -79,11 +80,11 @@ def test_a_firm_answer_stays_whatever_is_askew() -> None:
     more = prepared(np.vstack([surfaces("corner"), askew]))
     start = T.copy()
     start[:3, 3] += T[:3, :3] @ more.origin - target.origin
-    assert rotation_error_deg(made_parallel(start, more, target, 2 * VOXEL), start) < 0.05
+    assert rotation_error_deg(made_parallel(start, SharedSurface(more, target), 2 * VOXEL), start) < 0.05
 
 
 def test_without_directions_or_without_contact_it_stays() -> None:
     ball, corner = prepared(surfaces("sphere")), prepared(surfaces("corner"))
     far = perturbation(np.zeros(3), np.array([100.0, 0, 0]), np.zeros(3))
     for T, clouds in ((np.eye(4), (ball, ball)), (far, (corner, corner))):
-        np.testing.assert_array_equal(made_parallel(T, *clouds, 2 * VOXEL), T)
+        np.testing.assert_array_equal(made_parallel(T, SharedSurface(*clouds), 2 * VOXEL), T)

@@ -17,6 +17,7 @@ from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.scale import Scale, likely_unit_ratio, measure_scale, seeming_units
+from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
@@ -40,7 +41,7 @@ def two_scans(factor: float) -> tuple[PreparedCloud, PreparedCloud, FloatArray]:
 @pytest.mark.parametrize("factor", [0.9, 0.98, 1.02, 1.05, 1.1])
 def test_the_ratio_is_measured(factor: float) -> None:
     source, target, T = two_scans(factor)
-    found = measure_scale(T, source, target)
+    found = measure_scale(T, SharedSurface(source, target))
     assert found is not None and found.differs
     assert found.ratio == pytest.approx(factor, abs=0.004)
     assert found.sigma < 0.006
@@ -48,7 +49,10 @@ def test_the_ratio_is_measured(factor: float) -> None:
 
 def test_one_size_is_one_size_and_exchange_inverts_the_ratio() -> None:
     source, target, T = two_scans(1.0)
-    found, back = measure_scale(T, source, target), measure_scale(np.linalg.inv(T), target, source)
+    found, back = (
+        measure_scale(T, SharedSurface(source, target)),
+        measure_scale(np.linalg.inv(T), SharedSurface(target, source)),
+    )
     assert found is not None and back is not None
     assert not found.differs and not back.differs
     assert found.ratio == pytest.approx(1, abs=0.004)
@@ -60,7 +64,7 @@ def test_a_bent_body_is_no_other_size() -> None:
     source, target, T = two_scans(1.0)
     stretch = Rotation.random(random_state=2).as_matrix() * np.array([1.04, 0.96, 1.0])
     bent = prepared(target.points @ (stretch @ np.linalg.inv(stretch / [1.04, 0.96, 1.0])).T)
-    found = measure_scale(T, source, bent)
+    found = measure_scale(T, SharedSurface(source, bent))
     assert found is not None and not found.differs
     assert found.sigma > 0.015
 
@@ -69,7 +73,7 @@ def test_next_to_nothing_shared_has_no_scale() -> None:
     source, target, T = two_scans(1.0)
     away = T.copy()
     away[0, 3] += 100
-    assert measure_scale(away, source, target) is None
+    assert measure_scale(away, SharedSurface(source, target)) is None
 
 
 def test_units_are_named_by_their_ratio() -> None:

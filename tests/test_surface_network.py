@@ -186,7 +186,9 @@ def test_a_right_transform_that_was_proposed_badly_is_refined_before_the_costly_
     pair, T = sample
     line = Pipeline(resolved(RegistrationConfig()))
     off = T @ make_transform(Rotation.from_rotvec([0, 0.08, 0]).as_matrix(), np.array([0.1, 0.0, 0.05]))
-    selection = Selection(pair, line.scorers, line.refiner, line.config, StageClock(), line.second_scorers)
+    selection = Selection(
+        pair, line.scorers, line.refiner.about(pair), line.config, StageClock(), line.second_scorers
+    )
     selection.add([Hypothesis(wrong(T)), Hypothesis(off)])
     decision = selection.decide(4, 4)
     finished = [h for h in selection.hypotheses if h.is_refined]
@@ -235,7 +237,9 @@ def test_scorers_of_the_second_look_choose_and_leave_score_and_lead_alone(sample
     beside = make_transform(np.eye(3), BESIDE) @ T
 
     def decided(choosing):
-        selection = Selection(both, line.scorers, line.refiner, line.config, StageClock(), choosing)
+        selection = Selection(
+            both, line.scorers, line.refiner.about(both), line.config, StageClock(), choosing
+        )
         selection.add([Hypothesis(T), Hypothesis(beside)])
         return selection.decide(4, 4)
 

@@ -278,7 +278,7 @@ def selection(pair) -> Selection:
     source, target = pair[:2]
     seen = Pair(Correspondences(np.zeros((0, 6))), source.voxel_size, THRESHOLD, 0, source, target)
     scorers = {"surfaces": SurfaceScorer()}
-    return Selection(seen, scorers, NoRefiner(), RegistrationConfig(), StageClock())
+    return Selection(seen, scorers, NoRefiner().about(seen), RegistrationConfig(), StageClock())
 
 
 def test_ranking_puts_the_truth_first_and_keeps_every_hypothesis(pair, verifier: Verifier) -> None:

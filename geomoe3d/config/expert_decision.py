@@ -129,7 +129,13 @@ class ScaleExpert(Section):
         "how far nearest neighbours are sought from round to round, wide enough at first for a scale of 0.8",
     )
     thorough_rounds: int = constant(4, "rounds", (1, 100), "the last ones, which ask all points")
-    settled: float = constant(2e-4, "ln(ratio)", (0, 0.1), "a change that ends them")
+    settled: float = constant(
+        5e-4,
+        "ln(ratio)",
+        (0, 0.1),
+        "a change that ends them",
+        "a twentieth of what the bending of scans leaves open",
+    )
     nearly_settled: float = constant(
         2e-3, "ln(ratio)", (0, 0.1), "a change that ends the rounds of few points"
     )

@@ -77,3 +77,15 @@ class AlignmentExpert(Section):
         "beyond the reach: points may come nearer in the course, and normals need their neighbours",
     )
     normal_neighbors: int = constant(20, "points", (3, 1000), "that a normal and a covariance are fitted to")
+    coarse_part: int = constant(
+        3,
+        "points",
+        (1, 1000),
+        "of so many near the target one takes part in the first course",
+        "half the time",
+    )
+    coarse_neighbors: int = constant(10, "points", (3, 1000), "that their covariances are fitted to")
+    coarse_steps: int = constant(15, "steps", (1, 1000), "of the first course at most")
+    least_thinned: int = constant(
+        600, "points", (0, 1_000_000), "near the target; fewer take part in both courses"
+    )

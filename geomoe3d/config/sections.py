@@ -192,7 +192,7 @@ class RefinementConfig(PartConfig):
         "cost; svd fits the weighted correspondences anew and needs no clouds; none; or a class of your own",
     )
     max_distance: float = Field(1.5, gt=0, description="largest distance of matched points, in voxels")
-    max_iterations: int = Field(30, ge=1, description="most steps of the refinement")
+    max_iterations: int = Field(10, ge=1, description="most steps of the last course of the refinement")
     parallel: bool = Field(
         True,
         description="in the end the answer is turned so that walls and floors of both scans are parallel, as far as "

@@ -4,7 +4,7 @@ Place: decide, after the scale. Gaps between surfaces are not independent from p
 robot has laid together is bent, and a bend is common to all points of a place. A residual variance divided by
 thousands of points would promise far too much. So, as far as the shared surfaces are seen to be bent, one residual
 counts as one observation of the whole, and the bend itself adds what it moves. The weights are fitted on generated
-pairs (scripts/measure_accuracy.py). About 10 ms, whatever the size of the clouds.
+pairs (scripts/measure_accuracy.py). About 5 ms, whatever the size of the clouds.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ from geomoe3d.decision.shared_surface import (
 )
 from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.se3 import cross_matrix, residuals, transform_points
-from geomoe3d.types import Accuracy, Correspondences, FloatArray, PreparedCloud
+from geomoe3d.types import Accuracy, Correspondences, FloatArray
 
 
 def measure_accuracy(
     T_target_source: FloatArray,
-    source: PreparedCloud,
-    target: PreparedCloud,
+    shared: SharedSurface,
     matched: Correspondences,
     threshold: float,
 ) -> Accuracy | None:
@@ -35,23 +34,23 @@ def measure_accuracy(
 
     Args:
         T_target_source: (4, 4) the answer, local coordinates.
-        source, target: on one grid.
+        shared: of both clouds.
         matched: the correspondences, of which those that agree make the inlier RMSE.
         threshold: of an inlier, cloud units.
 
     Returns:
         None where too few points lie on each other and face alike.
     """
-    contact = SharedSurface(source, target).contact(T_target_source, threshold)
+    contact = shared.contact(T_target_source, threshold)
     if len(contact.gaps) < expert().accuracy.least_points:
         return None
     distances = np.abs(contact.gaps)
     agreeing = residuals(T_target_source, matched.source, matched.target)
     agreeing = agreeing[agreeing < threshold]
-    places = np.vstack([transform_points(T_target_source, source.points), target.points])
+    places = np.vstack([transform_points(T_target_source, shared.source.points), shared.target.points])
     center = contact.points.mean(0)
     farthest = places[np.argmax(np.sum((places - center) ** 2, axis=1))]
-    radius, covariance = covariance_of(contact, center, source.voxel_size)
+    radius, covariance = covariance_of(contact, center, shared.source.voxel_size)
     J = np.hstack([-cross_matrix((farthest - center) / radius), np.eye(3)])
     variances = np.trace(covariance[3:, 3:]), np.trace(J @ covariance @ J.T), np.trace(covariance[:3, :3])
     at_center, at_farthest, turned = np.sqrt(variances)

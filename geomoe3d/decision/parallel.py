@@ -18,12 +18,11 @@ from geomoe3d.decision.accuracy import covariance_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import cross_matrix, make_transform
+from geomoe3d.runtime.threads import each
 from geomoe3d.types import FloatArray, PreparedCloud
 
 
-def made_parallel(
-    T_target_source: FloatArray, source: PreparedCloud, target: PreparedCloud, threshold: float
-) -> FloatArray:
+def made_parallel(T_target_source: FloatArray, shared: SharedSurface, threshold: float) -> FloatArray:
     """The answer (4, 4), its main directions made parallel as far as its surfaces allow; itself where they say nothing.
 
     Source: maximum a posteriori with the surfaces as prior; directions that stay apart count for little
@@ -31,18 +30,17 @@ def made_parallel(
 
     Args:
         T_target_source: local coordinates.
-        source, target: on one grid.
+        shared: of both clouds.
         threshold: of an inlier, cloud units.
     """
     known = expert().parallel
-    ours, theirs = paired_directions(
-        main_directions(source) @ T_target_source[:3, :3].T, with_right_angles(main_directions(target))
-    )
-    contact = SharedSurface(source, target).contact(T_target_source, threshold)
+    ours, theirs = each(main_directions, (shared.source, shared.target))
+    ours, theirs = paired_directions(ours @ T_target_source[:3, :3].T, with_right_angles(theirs))
+    contact = shared.contact(T_target_source, threshold)
     if not len(ours) or len(contact.gaps) < expert().accuracy.least_points:
         return T_target_source
     center = contact.points.mean(0)
-    radius, covariance = covariance_of(contact, center, source.voxel_size)
+    radius, covariance = covariance_of(contact, center, shared.source.voxel_size)
     spread = float(np.trace(covariance))
     if not (np.isfinite(spread) and spread > 0):  # surfaces without any gap, such as a plane on itself
         return T_target_source

@@ -20,16 +20,17 @@ from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement, judge, lead_over
 from geomoe3d.decision.information import measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
-from geomoe3d.refinement.base import Refiner
+from geomoe3d.refinement.base import PairRefiner
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import PairScorer, Scorer
 from geomoe3d.scoring.surfaces import SURFACES, SurfaceScorer, evidence_of
-from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import BoolArray, FloatArray, Hypothesis, PreparedCloud
 
 _UNREFINED = (
     "the answer could not be refined without fitting less well, and where the sensors stood is not known; right "
     "answers can be"
 )
+_WORSE = "refinement made the clouds fit less well; the unrefined transform is given"
 
 
 class Selection:
@@ -39,7 +40,7 @@ class Selection:
         pair: clouds with features on one grid, and the correspondences of which a right answer has its share.
         scorers: by name, in the order in which they are asked. Without any the first hypothesis that was added
             is the answer, and the clouds only say how sure it is.
-        refiner: polishes the best hypotheses.
+        refiner: polishes the best hypotheses of the pair; one that several selections share polishes none twice.
         config: of the registration.
         clock: told of the stages score, refine and decide.
         choosing: scorers that are asked about refined candidates alone. They help to choose the answer; its score, lead
@@ -50,7 +51,7 @@ class Selection:
         self,
         pair: Pair,
         scorers: Mapping[str, Scorer],
-        refiner: Refiner,
+        refiner: PairRefiner,
         config: RegistrationConfig,
         clock: StageClock,
         choosing: Mapping[str, Scorer] = MappingProxyType({}),
@@ -60,7 +61,7 @@ class Selection:
         self._source, self._choosing = pair.clouds[0], choosing
         surfaces = scorers.get(SURFACES, SurfaceScorer())
         self._bound: dict[str, PairScorer] = {SURFACES: surfaces.about(pair)}
-        self._refiner = refiner.about(pair)
+        self._refiner = refiner
         self._first: Hypothesis | None = None
         self._guess: FloatArray | None = None
         self.hypotheses: list[Hypothesis] = []
@@ -194,10 +195,11 @@ class Selection:
         then asked about finished transforms. Many right ones are proposed too far off to be liked as they are."""
         self._clock("refine")
         by_clouds = sorted(self.hypotheses, key=lambda h: -evidence_of(h).surface_score)
-        for hypothesis in distinct(by_clouds, self._source, self._shift, count):
-            if not hypothesis.is_refined and hypothesis.refined is None:
-                hypothesis.refined = replace(self._refined(hypothesis), is_refined=True)
-                self.hypotheses.append(hypothesis.refined)
+        best = distinct(by_clouds, self._source, self._shift, count)
+        todo = [h for h in best if not h.is_refined and h.refined is None]
+        for hypothesis, refined in zip(todo, self._refined(todo), strict=True):
+            hypothesis.refined = replace(refined, is_refined=True)
+            self.hypotheses.append(hypothesis.refined)
         self._rank()
 
     def _refine(self, hypothesis: Hypothesis) -> Hypothesis:
@@ -208,7 +210,7 @@ class Selection:
         if hypothesis.is_refined:
             return hypothesis
         if hypothesis.refined is None:  # a second look often likes what the first one did
-            hypothesis.refined = self._refined(hypothesis)
+            (hypothesis.refined,) = self._refined([hypothesis])
         refined = hypothesis.refined
         same = refined.T_target_source is hypothesis.T_target_source
         for name in self._scorers:
@@ -221,19 +223,26 @@ class Selection:
                 self._ask(name, [refined])
         return refined
 
-    def _refined(self, hypothesis: Hypothesis) -> Hypothesis:
-        """Refined, and scored by the clouds alone."""
-        T, note = self._refiner(hypothesis)
-        start = replace(hypothesis, scores={}, asked=set(), note=note)
-        refined = start if T is None else replace(start, T_target_source=T, scores={}, asked=set())
-        self._ask(SURFACES, [start])
-        self._ask(SURFACES, [refined])
-        least = expert().selection.kept_evidence * evidence_of(start).surface_score
-        if evidence_of(refined).surface_score < least:
-            return replace(
-                start, note="refinement made the clouds fit less well; the unrefined transform is given"
-            )
-        return refined
+    def _refined(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """All refined, and scored by the clouds alone."""
+
+        def unrefined(hypothesis: Hypothesis, note: str | None) -> Hypothesis:
+            known = {SURFACES: hypothesis.scores[SURFACES]}
+            return replace(hypothesis, scores=known, asked={SURFACES}, note=note)
+
+        found: list[Hypothesis] = []
+        for hypothesis in hypotheses:
+            T, note = self._refiner(hypothesis)
+            if T is None or T is hypothesis.T_target_source:
+                found.append(unrefined(hypothesis, note))
+            else:
+                found.append(replace(hypothesis, T_target_source=T, scores={}, asked=set(), note=note))
+        self._ask(SURFACES, [h for h in found if not h.asked])
+        for k, hypothesis in enumerate(hypotheses):
+            least = expert().selection.kept_evidence * evidence_of(hypothesis).surface_score
+            if evidence_of(found[k]).surface_score < least:
+                found[k] = unrefined(hypothesis, _WORSE)
+        return found
 
     def _rival(self, answer: Hypothesis) -> tuple[Hypothesis | None, float]:
         """The best clearly different hypothesis, and the answer's lead over it."""
@@ -281,13 +290,14 @@ def distinct(
     ranked: Iterable[Hypothesis], source: PreparedCloud, max_shift: float, limit: int
 ) -> list[Hypothesis]:
     """The best hypotheses that are all different transforms, at most ``limit``; see `are_different`."""
-    chosen: list[Hypothesis] = []
-    for hypothesis in ranked:
-        if len(chosen) == limit:
-            break
-        T = hypothesis.T_target_source
-        if all(are_different(c.T_target_source, T, source, max_shift) for c in chosen):
-            chosen.append(hypothesis)
+    given = list(ranked)
+    transforms = np.array([h.T_target_source for h in given]).reshape(-1, 4, 4)
+    left, chosen = np.ones(len(given), dtype=np.bool_), list[Hypothesis]()
+    while left.any() and len(chosen) < limit:
+        best = int(left.argmax())
+        chosen.append(given[best])
+        left[best] = False
+        left &= _differing(transforms[best], transforms, source, max_shift)
     return chosen
 
 
@@ -299,5 +309,13 @@ def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_s
         source: its centroid is where shifts are measured.
         max_shift: transforms closer than this, cloud units, and closer than 15 degrees are the same.
     """
-    shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
-    return shift > max_shift or turn > expert().selection.different_turn_deg
+    return bool(_differing(T_a, T_b[None], source, max_shift)[0])
+
+
+def _differing(T: FloatArray, others: FloatArray, source: PreparedCloud, max_shift: float) -> BoolArray:
+    """(K,) `are_different` of one transform (4, 4) and others (K, 4, 4)."""
+    shifts = np.linalg.norm((others - T)[:, :3] @ np.append(source.points.mean(0), 1.0), axis=1)
+    traces = np.einsum("kij,ij->k", others[:, :3, :3], T[:3, :3])
+    least = 1 + 2 * np.cos(np.radians(expert().selection.different_turn_deg))
+    found: BoolArray = (shifts > max_shift) | (traces < least)
+    return found

@@ -1,7 +1,7 @@
 """Points of two clouds that lie on each other under a transform: what scale and accuracy are fitted to.
 
 Both directions: each cloud's points beside the other's nearest ones, with gaps along the normals of the cloud that is
-asked. Trees are built once; a question costs some 3 ms.
+asked. One for all who ask about a pair; a question costs some 3 ms.
 """
 
 from __future__ import annotations
@@ -35,10 +35,14 @@ class Contact:
 
 
 class SharedSurface:
-    """Asks two clouds on one grid where they lie on each other."""
+    """Asks two clouds on one grid where they lie on each other; build once per pair.
+
+    Attributes:
+        source, target: the clouds.
+    """
 
     def __init__(self, source: PreparedCloud, target: PreparedCloud) -> None:
-        self._clouds = source, target
+        self.source, self.target = self._clouds = source, target
         known = expert().shared_surface
         self._asked, self._few = (
             tuple(drawn_rows(cloud.points, cloud.voxel_size, most) for cloud in self._clouds)

@@ -22,6 +22,7 @@ from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import judge, lead_over
 from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
+from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.places import Query, Window
@@ -183,7 +184,9 @@ class Search:
             self._clock("match")
             pair = self._line.match((self.scan, target), None, self._clock)
             _, proposed = self._line.propose(pair, self._clock)
-            selection = Selection(pair, self._line.scorers, self._line.refiner, self.config, self._clock)
+            selection = Selection(
+                pair, self._line.scorers, self._line.refiner.about(pair), self.config, self._clock
+            )
             selection.add([Hypothesis(T), *proposed])
             return Found(pair, selection.decide())
 
@@ -218,11 +221,12 @@ class Search:
             decision = decision.with_note(answer.note)
         self._clock("decide")
         T, pair = decision.T_target_source, best.pair
-        scale = measure_scale(T, *pair.clouds)
+        shared = SharedSurface(*pair.clouds)
+        scale = measure_scale(T, shared)
         if scale is not None:  # maps are bent where their scans were joined
             scale = replace(scale, sigma=expert().locating.scale_deviation * scale.sigma)
         decision = decision.with_scale(scale)
-        told = measure_accuracy(T, *pair.clouds, pair.matched, pair.inlier_threshold)
+        told = measure_accuracy(T, shared, pair.matched, pair.inlier_threshold)
         return Found(pair, replace(decision, accuracy=told), sure), distinct
 
     def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:

@@ -1,9 +1,9 @@
 """Refinement of one transform on the clouds: point-to-plane ICP or GICP, by small_gicp.
 
-The alignment uses one thread, so that the same input gives the same
-bytes on any machine; two clouds of 5,000 points take some 15 ms, since only what of the source lies near the target
-takes part: to find that a point is near nothing costs far more than to find its partner, in every step
-again. Lengths are passed in voxels, because small_gicp's stopping rule is an absolute length.
+The alignment uses one thread, so that the same input gives the same bytes on any machine; two clouds of 5,000 points
+take some 8 ms, since only what of the source lies near the target takes part: to find that a point is near nothing
+costs far more than to find its partner, in every step again. Lengths are passed in voxels, because small_gicp's
+stopping rule is an absolute length.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import RefinementConfig, expert
+from geomoe3d.geometry.draws import cell_ranks
 from geomoe3d.geometry.gicp import Aligned, LocalCloud, align, too_few
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.refinement.base import PairRefiner, Refiner, refiner
 from geomoe3d.runtime.threads import usable_threads
-from geomoe3d.types import FloatArray, PreparedCloud
+from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
 _UNREFINED = "the unrefined transform is given"
 
@@ -59,13 +60,16 @@ class CloudAligner:
         self._config, self._voxel = config, source.voxel_size
         self._centre = source.points.mean(0) / source.voxel_size
         self._source, self._target_cloud = source.points / source.voxel_size, target
+        ranks = cell_ranks(source.points, source.voxel_size, 0)
+        self._is_first = ranks % np.uint64(expert().alignment.coarse_part) == 0
+        self._known: dict[bytes, tuple[FloatArray | None, str | None]] = {}
 
     def __call__(self, T_target_source: FloatArray) -> tuple[FloatArray, str | None]:
         """The motion polished so that the source's points lie in the target's surface.
 
-        Twice: where the library stops hangs on where it began, by a tenth of a voxel at times, and hardly any more on
-        where a second course began. The second takes the points and covariances of the first, unless one moved so far
-        that others may be near now.
+        Twice, at first with a part of the points, where there are many: most steps of a start that is far off are
+        then cheap. Where the library stops hangs on where it began, by a tenth of a voxel at times, and hardly any
+        more on where a second course began. A motion that was polished before is not polished again.
 
         Args:
             T_target_source: (4, 4) start, local coordinates.
@@ -75,18 +79,31 @@ class CloudAligner:
             own `converged` is true even where nothing matched, so the number of matched points, finiteness
             and the distance moved are checked here.
         """
-        start = T_target_source.copy()
+        key = T_target_source.tobytes()
+        if key not in self._known:
+            self._known[key] = self._polished(T_target_source)
+        found, problem = self._known[key]
+        return (T_target_source, f"{problem}; {_UNREFINED}") if found is None else (found.copy(), None)
+
+    def _polished(self, T_target_source: FloatArray) -> tuple[FloatArray | None, str | None]:
+        """The motion polished, or None and why not."""
+        known, start = expert().alignment, T_target_source.copy()
         start[:3, 3] /= self._voxel
-        near = self._near(start)
-        found = self._aligned(near, start)
+        rows = self._near(start)
+        some = rows[self._is_first[rows]]
+        if thinned := known.coarse_part * len(some) >= known.least_thinned:
+            first = self._local(some, known.coarse_neighbors)
+        else:
+            some, first = rows, self._local(rows, known.normal_neighbors)
+        found = self._aligned(first, start, known.coarse_steps)
         if found.T_target_source is None:
-            return T_target_source, f"{found.problem}; {_UNREFINED}"
+            return None, found.problem
         T = found.T_target_source
-        points = near.cloud.points()[:, :3]
-        moved = transform_points(T, points) - transform_points(start, points)
-        if np.sum(moved**2, axis=1).max() > (expert().alignment.margin / 2) ** 2:
-            near = self._near(T)
-        again = self._aligned(near, T).T_target_source
+        moved = transform_points(T, self._source[some]) - transform_points(start, self._source[some])
+        if np.sum(moved**2, axis=1).max() > (known.margin / 2) ** 2:  # then others may be near now
+            rows, thinned = self._near(T), True
+        every = self._local(rows, known.normal_neighbors) if thinned else first
+        again = self._aligned(every, T, self._config.max_iterations).T_target_source
         T = T if again is None else again
         T[:3, 3] *= self._voxel
         return T, None
@@ -96,7 +113,7 @@ class CloudAligner:
         """The target as the library takes it, in voxels; made once, whatever is polished."""
         return LocalCloud.of(self._target_cloud.points / self._voxel, expert().alignment.normal_neighbors)
 
-    def _aligned(self, source: LocalCloud, start: FloatArray) -> Aligned:
+    def _aligned(self, source: LocalCloud, start: FloatArray, max_steps: int) -> Aligned:
         """The motion near ``start``, in voxels, by one course of the library."""
         config = self._config
         if source.cloud.size() < expert().alignment.least_matched:
@@ -108,16 +125,19 @@ class CloudAligner:
             self._centre,
             reach=config.max_distance,
             method=config.name,
-            max_iterations=config.max_iterations,
+            max_iterations=max_steps,
         )
 
-    def _near(self, start: FloatArray) -> LocalCloud:
-        """What of the source lies within the reach of the refinement, and some more, of the target, in voxels."""
+    def _near(self, start: FloatArray) -> IntArray:
+        """Rows of the source within the reach of the refinement, and some more, of the target, under ``start``."""
         reach = (self._config.max_distance + expert().alignment.margin) * self._voxel
         moved = self._voxel * transform_points(start, self._source)
         distance, _ = self._target_cloud.tree.query(
             moved, distance_upper_bound=reach, workers=usable_threads()
         )
-        near = self._source[np.isfinite(distance)]
-        wanted = self._config.name == "gicp" and len(near) >= expert().alignment.least_matched
-        return LocalCloud.of(near, expert().alignment.normal_neighbors if wanted else None)
+        return np.flatnonzero(np.isfinite(distance))
+
+    def _local(self, rows: IntArray, num_neighbors: int) -> LocalCloud:
+        """These points of the source as the library takes them, in voxels."""
+        wanted = self._config.name == "gicp" and len(rows) >= expert().alignment.least_matched
+        return LocalCloud.of(self._source[rows], num_neighbors if wanted else None)

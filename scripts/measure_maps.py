@@ -250,7 +250,9 @@ def ask(method: str, query: Query, scan: FloatArray, world: FloatArray, made: Ma
     if made is not None:
         found = made.locate(scan, k=ALIKE)
         T: FloatArray | None = found.T_map_scan
+        evidence = found.result.evidence
         line = {"status": found.status, "confidence": found.result.confidence}
+        line |= {name: evidence.get(name) for name in ("scale_ratio", "scale_sigma")}
         places = [place.T_map_scan for place in found.places]
     else:
         given = MethodInput(query.key, source=scan, target=world, voxel_size=GRID, inlier_threshold=2 * GRID)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from generated_buildings import GRID, first_room, other_room, scanned, view
+from scipy.spatial.transform import Rotation
 
 import geomoe3d
 from geomoe3d import Map
@@ -20,11 +22,12 @@ from geomoe3d.features.base import with_features
 from geomoe3d.features.learned import LearnedDescriptor
 from geomoe3d.features.multiscale import MultiscaleDescriptor
 from geomoe3d.features.pyramid import pyramid
-from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.maps import store
 from geomoe3d.maps.facing import both_sides, facing_alike
+from geomoe3d.maps.level import Compared
 from geomoe3d.maps.pieces import pieces
-from geomoe3d.maps.places import Query
+from geomoe3d.maps.places import Query, Window
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.types import PreparedCloud
 
@@ -216,7 +219,38 @@ def test_units_and_sizes_that_cannot_be_fail_with_the_reason(house, scan):
     assert "too coarse" in smaller.result.reasons[0]
 
 
+@pytest.mark.parametrize("times", [1000.0, 0.001])
+def test_a_cloud_in_another_unit_is_not_added(house, building, times):
+    with pytest.raises(InputError, match="bring both to one unit"):
+        house.with_cloud(UTM + times * (building - UTM))
+
+
+def test_a_map_is_described_on_coarser_grids_too_so_that_any_scan_finds_one(building):
+    made = Map.from_cloud(building)
+    np.testing.assert_allclose(np.divide(made.voxel_sizes, made.voxel_sizes[0]), (1, 2), rtol=0.1)
+    assert 4 * made.voxel_sizes[0] > made._voxels.edge_for(expert().maps.least_described)
+
+
 # ---- the parts -----------------------------------------------------------------------------------------
+
+
+def test_of_a_small_scan_also_second_choices_propose():
+    rng = np.random.default_rng(11)
+    points, T = rng.uniform(-1, 1, (60, 3)), make_transform(Rotation.random(rng=3).as_matrix(), np.ones(3))
+    normals, features = rng.normal(size=(60, 3)), rng.normal(size=(60, 65)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    alike = features + rng.normal(0, 0.02, features.shape).astype(np.float32)
+    alike /= np.linalg.norm(alike, axis=1, keepdims=True)
+    there = Compared(  # each point has its partner, and elsewhere one that is more like it
+        np.concatenate([transform_points(T, points), rng.uniform(-2, 2, (60, 3))]),
+        np.concatenate([normals @ T[:3, :3].T, normals]),
+        np.concatenate([alike, features]),
+    )
+    level = SimpleNamespace(compared=there, voxel_size=0.02)
+    window = Window(np.ones(3), np.arange(120), 1.0)
+    best = Query(Compared(points, normals, features), level).motions(window, 1)[0]
+    np.testing.assert_allclose(best.T_target_source, T, atol=1e-3)
 
 
 def test_voxels_are_those_of_the_whole_in_whatever_pieces():

@@ -82,7 +82,10 @@ def command(
     if not quiet:
         added = len(made.sources) - len(before)
         sizes = ", ".join(f"{size:.4g}" for size in made.voxel_sizes)
-        clouds = counted(len(made.sources), "cloud")
+        clouds, grids = (
+            counted(len(made.sources), "cloud"),
+            "a grid" if len(made.voxel_sizes) == 1 else "grids",
+        )
         click.echo(
-            f"{out}: {counted(made.num_points, 'point')} of {clouds} ({added} new), indexed on a grid of {sizes}"
+            f"{out}: {counted(made.num_points, 'point')} of {clouds} ({added} new), indexed on {grids} of {sizes}"
         )

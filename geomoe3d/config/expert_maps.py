@@ -34,11 +34,23 @@ class MapsExpert(Section):
     most_points: int = constant(
         1_000_000, "points", (1000, 1_000_000_000), "of it at most: 40 s of processor time, and 220 MB"
     )
+    least_described: int = constant(
+        2000,
+        "points",
+        (100, 100_000_000),
+        "of the coarser grids on which a map is described beforehand, at least",
+    )
     asked_points: int = constant(
         300_000,
         "points",
         (1000, 1_000_000_000),
         "at most, of a grid on which a map is described because a scan asks for it",
+    )
+    around_points: int = constant(
+        100_000,
+        "points",
+        (1000, 100_000_000),
+        "at most, of what is described anew around the places that were found",
     )
     candidates: int = constant(4, "places", (1, 1000), "that are compared as pairs of scans are")
     largest_scan: float = constant(
@@ -57,7 +69,7 @@ class MapsExpert(Section):
         1000,
         "voxels",
         (10, 1_000_000),
-        "that a scan fills on the grid on which it is sought again",
+        "that a scan fills on the coarser grid on which it is sought in the end",
         "a fragment with 3,200 of them was missed in its room, and found with 1,100",
     )
     known: float = constant(
@@ -96,7 +108,13 @@ class PlacesExpert(Section):
         )
     )
     threshold: float = constant(3.0, "voxels", (0.1, 100), "of an inlier: what is compared is two apart")
-    proposed: int = constant(6, "hypotheses", (1, 1000), "that consensus keeps of a window")
+    choices: int = constant(
+        3,
+        "matches",
+        (1, 100),
+        "of a point at most, where a scan has fewer points than matches are wanted",
+        "of a fragment with 211 points 20 to 40 matches of three choices were right, 5 to 14 of one",
+    )
     seeds: tuple[Annotated[int, Field(ge=1, le=100_000)], Annotated[int, Field(ge=1, le=100_000)]] = constant(
         (250, 500), "matches", None, "that consensus begins with, at first and later"
     )
@@ -132,8 +150,12 @@ class LocatingExpert(Section):
         "of the votes of a window with such a transform, from which another may hold one",
         "the windows of ten rooms that are one had 0.8 to 1 of the votes of the best",
     )
-    kept: int = constant(12, "candidates", (1, 10_000), "that are different")
-    polished: int = constant(8, "candidates", (1, 10_000), "that are drawn closer")
+    kept: tuple[Annotated[int, Field(ge=1, le=10_000)], Annotated[int, Field(ge=1, le=10_000)]] = constant(
+        (12, 36), "candidates", None, "that are different, at first and later"
+    )
+    polished: tuple[Annotated[int, Field(ge=1, le=10_000)], Annotated[int, Field(ge=1, le=10_000)]] = (
+        constant((8, 36), "candidates", None, "that are drawn closer, at first and later")
+    )
     worth_polishing: float = constant(
         0.4, "share", (0, 1), "of the best candidate's quick score, from which one is drawn closer"
     )
@@ -143,7 +165,9 @@ class LocatingExpert(Section):
         None,
         "within which points are matched, step by step",
     )
-    per_window: int = constant(6, "hypotheses", (1, 1000), "taken from a window")
+    per_window: tuple[Annotated[int, Field(ge=1, le=1000)], Annotated[int, Field(ge=1, le=1000)]] = constant(
+        (6, 20), "hypotheses", None, "of a window, at first and later"
+    )
     asked: int = constant(400, "points", (10, 1_000_000), "of the scan, in a quick look")
     asked_back: int = constant(800, "points", (10, 1_000_000), "of the map, in a quick look")
     close: float = constant(

@@ -25,9 +25,8 @@ from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-Look = Literal["quick", "more", "finer"]
-"""At the likeliest windows; at more of them, with more matches and on a coarse grid; around what was found, on the
-scan's own grid."""
+Look = Literal["quick", "more", "coarser", "finer"]
+"""At the likeliest windows; at more, with more matches; that on a coarser grid; where it was found, on the scan's."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Finder:
         rule = self.line.config.preparation.viewpoint
         view = find_viewpoints(cloud, cloud, rule)[0]
         local = [shift_frames(T, -cloud.origin, -self.voxels.origin) for T in guesses]
-        own, sought, coarsest = self._grids(cloud)
+        own, coarsest = self._grids(cloud)
         level = self.level_for(own, coarsest)
         search = self._begun(cloud, view, level, clock)
         known: list[FloatArray] = []
@@ -77,17 +76,16 @@ class Finder:
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
-            if look == "more" and expert().maps.finer * search.level.voxel_size < sought:
-                search = self._begun(cloud, view, self.level_for(sought, coarsest), clock)
-            if look == "finer":
-                finer = self._around(search, known[:count], own)
-                if finer is None:
-                    break
-                search = self._begun(cloud, view, finer, clock)
+            if look in ("coarser", "finer"):
+                coarser = look == "coarser"
+                other = self._coarser(search, cloud, own) if coarser else self._around(search, known, own)
+                if other is None:
+                    continue
+                search = self._begun(cloud, view, other, clock)
             asked = [*local, *known]
             candidates = search.candidates(more=look != "quick", near=where, given=asked, times=times)
-            known = [h.T_target_source for _, h in candidates]
-            found = [search.look(h, fully=look != "quick") for h in likely(candidates, count)]
+            known = [h.T_target_source for h in likely(candidates, count)]
+            found = [search.look(Hypothesis(T), fully=look != "quick") for T in known]
             if not found:
                 continue
             latest, others = search.decide(found)
@@ -98,24 +96,21 @@ class Finder:
         if best is None or best.decision.answer is None:
             return None, []
         decision = best.decision
-        read = (given, self.name), best.pair.clouds, search.level.voxel_size, view is not None
+        read = (given, self.name), best.pair.clouds, best.pair.clouds[0].voxel_size, view is not None
         told_of = remarks(*read, self.line.config.preparation, decision.judgement)
         prior = self._prior_notes(search, decision.T_target_source, near, local)
         for sentence in (*cloud.notes, *prior, *told_of):
             decision = decision.with_note(sentence)
         return replace(best, decision=decision), ranked
 
-    def _grids(self, cloud: PointCloud) -> tuple[float, float, float]:
-        """Edges of the grid that suits a scan, of the one on which it is sought again, and of the coarsest that serves
-        it."""
+    def _grids(self, cloud: PointCloud) -> tuple[float, float]:
+        """Edges of the grid that suits a scan, and of the coarsest one that serves it."""
         preparation, given = self.line.config.preparation, self.line.config.voxel_size
         own = given or choose_voxel_size(cloud, cloud, preparation.voxel_points)
         own = bounded_voxel_size(cloud, cloud, own, preparation.max_points)
         if given is not None:
-            return own, own, expert().maps.finer * own
-        known = expert().maps.sought_voxels, expert().maps.least_voxels
-        sought, coarsest = (max(own, choose_voxel_size(cloud, cloud, count)) for count in known)
-        return own, sought, coarsest
+            return own, expert().maps.finer * own
+        return own, max(own, choose_voxel_size(cloud, cloud, expert().maps.least_voxels))
 
     def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
         """The search for a scan on a level."""
@@ -133,14 +128,26 @@ class Finder:
         size = level.voxel_size
         return PreparedCloud(nothing, nothing, None, size, None, origin, self.name, count, scanned=False)
 
+    def _coarser(self, search: Search, cloud: PointCloud, own: float) -> Level | None:
+        """The map on a grid that shows less of a scan; None where that is no coarser than the search's."""
+        if self.line.config.voxel_size is not None:
+            return None
+        sought = max(own, choose_voxel_size(cloud, cloud, expert().maps.sought_voxels))
+        if search.level.voxel_size * expert().maps.finer >= sought:
+            return None
+        return self.level_for(sought, expert().maps.finer * sought)
+
     def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
         """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
         if search.level.voxel_size <= expert().maps.finer * size or not motions:
             return None
         centers = [transform_points(T, search.center[None])[0] for T in motions]
         around = self.voxels.within(np.array(centers), 2 * search.reach)
+        size = max(size, around.edge, around.edge_for(expert().maps.around_points))
+        if search.level.voxel_size <= expert().maps.finer * size:
+            return None
         try:
-            return Level.of(around, max(size, around.edge), self.line.config.preparation)
+            return Level.of(around, size, self.line.config.preparation)
         except EmptyCloudError:
             return None
 
@@ -153,6 +160,7 @@ class Finder:
         yield "quick", None
         if self.line.config.second_look.grids or self.line.config.second_look.max_correspondences:
             yield "more", None
+            yield "coarser", None
             yield "finer", None
 
     def _prior_notes(

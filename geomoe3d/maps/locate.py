@@ -118,13 +118,13 @@ class Search:
         scored.sort(key=lambda item: -item[0])
         chosen: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in scored:
-            if len(chosen) >= times * known.kept:
+            if len(chosen) >= times * known.kept[more]:
                 break
             if all(self.differ(hypothesis, other) for _, other in chosen):
                 chosen.append((score, hypothesis))
         polished = [
             Hypothesis(self._polished(h.T_target_source))
-            for score, h in chosen[: math.ceil(times * known.polished)]
+            for score, h in chosen[: math.ceil(times * known.polished[more])]
             if score >= known.worth_polishing * chosen[0][0]
         ]
         both = [*chosen, *((self._quick(h.T_target_source), h) for h in polished)]
@@ -158,7 +158,7 @@ class Search:
                 break
             if found is not None and np.linalg.norm(window.center - found[1]) < self._query.radius:
                 continue
-            proposed = self._query.motions(window, known.per_window, more=more)
+            proposed = self._query.motions(window, known.per_window[more], more=more)
             if near is not None:
                 proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
             fresh = [(self._quick(h.T_target_source), h) for h in proposed]

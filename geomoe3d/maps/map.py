@@ -143,7 +143,8 @@ class Map:
             progress: as of `from_cloud`.
 
         Raises:
-            InputError: a cloud that cannot be read or has no usable points, or no rigid transform.
+            InputError: a cloud that cannot be read or has no usable points, one that seems to be in another unit than
+                the map, or no rigid transform.
         """
         tell = progress or (lambda stage: None)
         tell("load")
@@ -153,27 +154,32 @@ class Map:
         if any(read.sha256 == source.sha256 for source in self.sources):
             return self
         voxels, count = self._voxels, 0
+        corners = np.array([np.full(3, np.inf), np.full(3, -np.inf)])
         for points, seen_from in read.points():
             eye = seen_from if told is None else told
             place = None if eye is None else transform_points(T, eye[None])[0]
             moved = points if T_map_cloud is None else transform_points(T, points)
+            corners = np.stack([np.minimum(corners[0], moved.min(0)), np.maximum(corners[1], moved.max(0))])
             if not len(voxels):
                 voxels = _first(moved, read.name, read.origin if T_map_cloud is None else None)
             voxels = voxels.added(moved, place)
             while len(voxels) > expert().maps.most_voxels:
                 voxels = voxels.coarser()
             count += len(points)
+        if len(self._voxels):
+            self._check_added(read.name, float(np.linalg.norm(corners[1] - corners[0])))
         name = self.name if self.sources else read.name
         sources = (*self.sources, Source(read.name, read.sha256, count))
         return Map(voxels, (), sources, config=self.config, name=name, line=self._line)
 
     @expert_in_force
     def describe(self, voxel_size: float | None = None, *, progress: Progress | None = None) -> None:
-        """Describe the map on a grid now, so that the first scan need not wait for it.
+        """Describe the map now, so that the first scan need not wait for it.
 
         Args:
-            voxel_size: cloud units, at least that of the map's voxels; None takes that of the configuration, or one on
-                which the map has some 200,000 points at most.
+            voxel_size: of one grid, cloud units, at least that of the map's voxels; None takes that of the
+                configuration, or a grid on which the map has one in twenty of its points, 30,000 to a million, and two
+                coarser ones, which take a third of its time together.
             progress: called with the name of the stage.
 
         Raises:
@@ -183,13 +189,18 @@ class Map:
             raise EmptyCloudError("the map holds no points yet; add a cloud first: map.with_cloud(...)")
         if progress is not None:
             progress("describe")
-        wanted = voxel_size or self.config.voxel_size
+        known, wanted = expert().maps, voxel_size or self.config.voxel_size
+        sizes = [] if wanted is None else [wanted]
         if wanted is None:
-            known = expert().maps
             usual = min(max(known.usual_points, self.num_points // known.usual_share), known.most_points)
-            wanted = round_size(max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge))
-        if not any(wanted / expert().maps.finer <= x.voxel_size <= wanted for x in self._levels):
-            self._described(wanted)
+            finest = max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge)
+            coarsest = self._voxels.edge_for(known.least_described)
+            sizes = [
+                round_size(times * finest) for times in (1, 2, 4) if times * finest < coarsest or times == 1
+            ]
+        for size in sizes:
+            if not any(size / known.finer <= x.voxel_size <= size for x in self._levels):
+                self._described(size)
 
     @property
     def num_points(self) -> int:
@@ -285,6 +296,16 @@ class Map:
         made = Level.of(self._voxels, max(size, self._voxels.edge), self.config.preparation, self.name)
         self._levels = tuple(sorted((*self._levels, made), key=_size))
         return made
+
+    def _check_added(self, name: str, extent: float) -> None:
+        """Refuse a further cloud that would ruin the map."""
+        most = expert().preparation.most_extent_ratio
+        if extent > most * self._extent or extent < 5 * self._voxels.edge:
+            raise InputError(
+                f"'{name}' has an extent of {extent:.4g}, the map one of {self._extent:.4g} on voxels of "
+                f"{self._voxels.edge:.4g}: at most {most} times the map's extent and at least 5 of its voxels can be "
+                "added; bring both to one unit, or index the larger cloud first"
+            )
 
     def _refused(self, cloud: PointCloud) -> str | None:
         """A sentence where scan and map cannot belong together."""

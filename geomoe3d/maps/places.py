@@ -120,30 +120,30 @@ class Query:
         Args:
             window: where to.
             count: at most so many.
-            more: from twice as many matches: four times as long, and more is found.
+            more: from more matches and seeds: two to four times as long, and more is found.
         """
-        scan, there = self._scan, self.level.compared.take(window.keys)
-        index, distance, _, mutual = nearest_features(scan.features, there.features, 1, False)
-        choice, mutual_first = index[:, 0], mutual[:, 0]
-        rows = np.lexsort((distance[:, 0], ~mutual_first))[: expert().places.matches[more]]
-        columns = choice[rows]
+        scan, there, known = self._scan, self.level.compared.take(window.keys), expert().places
+        # A small scan has few points to match, and of their first choices too few are right.
+        choices = min(known.choices, math.ceil(known.matches[more] / len(scan.points)))
+        index, distance, _, mutual = nearest_features(scan.features, there.features, choices, False)
+        order = np.lexsort((distance.ravel(), ~mutual.ravel()))[: known.matches[more]]
+        rows, columns, first = order // index.shape[1], index.ravel()[order], mutual.ravel()[order]
         matched = Correspondences(
             np.hstack([scan.points[rows], there.points[columns]]),
             normals=(scan.normals[rows], there.normals[columns]),
             normals_signed=True,
         )
-        threshold = expert().places.threshold * self.level.voxel_size
-        known = expert().places
+        threshold = known.threshold * self.level.voxel_size
         estimate = ConsensusEstimator(
-            num_hypotheses=known.proposed, num_seeds=known.seeds[more], num_refined=known.refined[more]
+            num_hypotheses=count, num_seeds=known.seeds[more], num_refined=known.refined[more]
         )
         return estimate(
             matched.points,
-            np.where(mutual_first[rows], 1.0, 0.5),
+            np.where(first, 1.0, 0.5),
             inlier_threshold=threshold,
             seed=self.seed,
             surroundings=Surroundings.of(matched, threshold),
-        )[:count]
+        )
 
 
 def _votes(most: Float32Array) -> FloatArray:

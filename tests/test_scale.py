@@ -93,6 +93,13 @@ def test_what_differs_is_never_ok_and_what_is_not_believed_has_no_scale() -> Non
     told = sure.with_scale(Scale(1.1, 0.01)).judgement
     assert told.status == "low_confidence" and told.confidence < 0.8
     assert "1.1 times" in told.reasons[0] and told.reasons[1:] == ("so",)
+    unsure = Judgement(
+        "low_confidence", ("so", "confidence 0.92 is below 0.98"), 0.92, "confidence 0.92 is below 0.98"
+    )
+    told = replace(sure, judgement=unsure).with_scale(Scale(1.1, 0.01)).judgement
+    assert (
+        told.reasons[1:] == ("so",) and "1.1 times" in told.reasons[0]
+    )  # not two confidences in one verdict
     for fine in (Scale(1.1, 0.08), Scale(1.05, 0.02), Scale(1.005, 0.0001), None):
         assert sure.with_scale(fine).judgement == sure.judgement
     doubtful = replace(sure, judgement=Judgement("ambiguous", ("no",), 0.1))

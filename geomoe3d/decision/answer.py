@@ -101,11 +101,12 @@ class Decision:
         return replace(self, scale=scale).doubted(said)
 
     def doubted(self, reason: str) -> Decision:
-        """The same decision, never ok, for a reason that is said first."""
+        """The same decision, never ok, for a reason that is said first and stands for a mere lack of confidence."""
         was = self.judgement
+        others = (r for r in was.reasons if r != was.unspecific)
         status: Status = "low_confidence" if was.status == "ok" else was.status
         confidence = min(was.confidence, expert().causes.most_doubted)
-        return replace(self, judgement=Judgement(status, (reason, *was.reasons), confidence))
+        return replace(self, judgement=Judgement(status, (reason, *others), confidence))
 
     def residuals(self, matched: Correspondences) -> FloatArray:
         """|R p + t - q| of every correspondence (N,); infinite without a transform."""

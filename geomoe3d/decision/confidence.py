@@ -21,11 +21,18 @@ from geomoe3d.types import FloatArray, Hypothesis
 
 @dataclass(frozen=True)
 class Judgement:
-    """Status with its reasons, sentences, and the confidence in [0, 1]."""
+    """Status with its reasons, sentences, and the confidence in [0, 1].
+
+    Attributes:
+        status, reasons, confidence: as in the result.
+        unspecific: that one of the reasons which only says that the confidence is low, or None; it gives way where a
+            cause becomes known.
+    """
 
     status: Status
     reasons: tuple[str, ...]
     confidence: float
+    unspecific: str | None = None
 
 
 def judge(
@@ -93,11 +100,11 @@ def judge(
     if few is not None:
         return Judgement("low_confidence", (few, *notes), min(confidence, limits.most_doubted))
     if confidence < config.min_confidence:
-        notes.append(
+        low = (
             f"confidence {confidence:.2f} is below {config.min_confidence:.2f}: the scans may not overlap, "
             "or share too little distinctive surface"
         )
-        return Judgement("low_confidence", tuple(notes), confidence)
+        return Judgement("low_confidence", (*notes, low), confidence, low)
     return Judgement("ok", tuple(notes), confidence)
 
 

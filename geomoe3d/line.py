@@ -219,11 +219,16 @@ class Line:
             selection, looks = select(pair, proposed), [pair]
             decision = selection.decide()
             if given is None and sides == "sensor" and self._is_described_again(decision.judgement):
-                again, pair = line.described_again(pair, places, clock)
-                looks.append(again)
-                proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
-                weighed, selection = line.weigh(pair), select(pair, proposed, again=True)
-                decision = selection.decide(look.num_refined, look.num_judged)
+                described = line.described_again(pair.clouds, clock)
+                if decision.judgement.status == "ok":
+                    seen = line.pair(described, pair.matched, places)
+                    decision = selection.check(decision, line.second_scorers, seen, decide, look.num_checked)
+                if decision.judgement.status != "ok":
+                    again, pair = line.matched_again(pair, described, places, clock)
+                    looks.append(again)
+                    proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
+                    weighed, selection = line.weigh(pair), select(pair, proposed, again=True)
+                    decision = selection.decide(look.num_refined, look.num_judged)
             if self._is_doubtful(decision.judgement):
                 if given is None:
                     more = line.more_matches(looks, places, clock)
@@ -238,9 +243,11 @@ class Line:
         return Look(pair, weighed, decision)
 
     def _is_described_again(self, judgement: Judgement) -> bool:
-        """Whether the second descriptor is to be asked."""
+        """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little."""
         known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
-        return known and judgement.status != "ok" and not self.once
+        least = self.config.second_look.checked_below if self.pipeline.second_scorers else 0.0
+        doubtful = judgement.status != "ok" or judgement.confidence < least
+        return known and doubtful and not self.once
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""

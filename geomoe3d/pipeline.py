@@ -195,8 +195,8 @@ class Pipeline:
         source = with_normals_flipped(clouds[0], self.descriptor)
         return source, replace(clouds[1], viewpoint=None)
 
-    def described_again(self, pair: Pair, places: Places, clock: StageClock) -> tuple[Pair, Pair]:
-        """The pair with what the second descriptor says: its features with its matches alone, and with those of both.
+    def described_again(self, clouds: Clouds, clock: StageClock) -> Clouds:
+        """Both clouds with what the second descriptor says of them.
 
         Raises:
             ValueError: there is no second descriptor.
@@ -204,8 +204,14 @@ class Pipeline:
         if self.second_descriptor is None:
             raise ValueError("there is no second descriptor")
         clock("features")
-        source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in pair.clouds)
-        own = self.match((source, target), places, clock, draw=1)  # other points than the first one's
+        source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in clouds)
+        return source, target
+
+    def matched_again(
+        self, pair: Pair, described: Clouds, places: Places, clock: StageClock
+    ) -> tuple[Pair, Pair]:
+        """The pair with ``described`` clouds, see `described_again`: with their matches alone, and with those of both."""
+        own = self.match(described, places, clock, draw=1)  # other points than the first one's
         return own, self.together((pair, own), places)
 
     def more_matches(self, looks: Sequence[Pair], places: Places, clock: StageClock) -> list[Pair]:

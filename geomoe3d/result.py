@@ -40,6 +40,7 @@ class RegistrationResult:
         evidence: what the clouds say of the answer, see `geomoe3d.scoring.surfaces.Evidence` (measured from the
             cloud with more points, whichever the source is; the overlap from the source);
             ``overlap_target``, the share of target voxel points with a source point within the threshold;
+            ``margin``, by how much the surface network prefers the answer, where it was asked;
             ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; ``scale_ratio``
             and ``scale_sigma``, see `geomoe3d.decision.scale.Scale`, where enough surface is shared; empty
             where nothing was estimated.

@@ -1,14 +1,16 @@
 """Fits the confidence: P(the answer is right) as a logistic function of what the clouds say of it.
 
     python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 250] [--set scoring.scorers=[surfaces]]
-        [--set preparation.viewpoint=centroid] [--out runs/confidence.jsonl]
+        [--set preparation.viewpoint=centroid] [--second-look] [--out runs/confidence.jsonl]
 
 FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
 recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix them, unrelated ones from
 different scenes and, every second, from far parts of one. Every pair is registered twice, without a second
 look and always with one, since the confidence decides about it; the outcomes go to OUT, and what is there is
 not done again: give another OUT for other weights or code. Prints coefficients for
-`geomoe3d/decision/confidence.py`, cross-validated over scenes. Needs scikit-learn, which the package itself
+`geomoe3d/decision/confidence.py`, cross-validated over scenes. With --second-look every pair is registered as users
+do, twice as many pairs of little overlap are drawn, and the fit is that of answers which the surface network was asked
+about: of what the fit of the evidence says and of the network's margin. Needs scikit-learn, which the package itself
 does not.
 """
 
@@ -25,7 +27,12 @@ import numpy as np
 
 from geomoe3d.config import expert, load_config
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
-from geomoe3d.decision.confidence import CONFIDENCE_INPUTS, confidence_inputs
+from geomoe3d.decision.confidence import (
+    CONFIDENCE_INPUTS,
+    confidence_inputs,
+    confidence_score,
+    margin_inputs,
+)
 from geomoe3d.decision.information import Information
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.evaluation.metrics import is_right, motion_errors
@@ -33,6 +40,7 @@ from geomoe3d.geometry.se3 import inverse
 from geomoe3d.registration import Registrar
 from geomoe3d.result import RegistrationResult
 from geomoe3d.scoring.surfaces import Evidence
+from geomoe3d.types import FloatArray
 
 BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 """Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""
@@ -42,10 +50,16 @@ LOOKS = (
     ["second_look.below=1.0", "decision.min_confidence=1.0"],
 )
 """Settings by which a pair gets one look, and always two."""
+AS_USERS_DO: tuple[list[str], ...] = ([],)
+"""The same for --second-look: a second look where the first one is in doubt."""
+LOW_BANDS = ((0.10, 0.30, 3), (0.30, 1.01, 1))
+"""Overlap from, to, and share of the pairs for --second-look."""
 Drawn = tuple[str, str, str, list[Any] | None, bool]
 
 
-def draw(folders: list[str], count: int, unrelated: int) -> list[Drawn]:
+def draw(
+    folders: list[str], count: int, unrelated: int, bands: tuple[tuple[float, float, int], ...] = BANDS
+) -> list[Drawn]:
     """(scene, source, target, true motion or None, whether related), the same for the same folders and counts.
 
     Of the unrelated ones every second is of one scene, two fragments that no list says to overlap: furniture that
@@ -57,9 +71,9 @@ def draw(folders: list[str], count: int, unrelated: int) -> list[Drawn]:
         for pair in open_collection(folder).pairs:
             by_scene.setdefault(f"{folder}/{pair.scene}", []).append(pair)
     everything = [(scene, pair) for scene, pairs in sorted(by_scene.items()) for pair in pairs]
-    total = sum(share for _, _, share in BANDS)
+    total = sum(share for _, _, share in bands)
     chosen: list[Drawn] = []
-    for low, high, share in BANDS:
+    for low, high, share in bands:
         band = [e for e in everything if e[1].overlap is not None and low <= e[1].overlap < high]
         for k in rng.permutation(len(band))[: round(count * share / total)]:
             scene, pair = band[k]
@@ -93,7 +107,9 @@ def unlisted(scene: str, pairs: list[PosedPair]) -> list[tuple[str, str, str, li
     ]
 
 
-def measure(pairs: list[Drawn], out: Path, assignments: list[str]) -> list[dict[str, Any]]:
+def measure(
+    pairs: list[Drawn], out: Path, assignments: list[str], looks: tuple[list[str], ...] = LOOKS
+) -> list[dict[str, Any]]:
     """One record per pair and look; those in the file are kept."""
     out.parent.mkdir(parents=True, exist_ok=True)
     lines = out.read_text().splitlines() if out.exists() else []
@@ -102,7 +118,7 @@ def measure(pairs: list[Drawn], out: Path, assignments: list[str]) -> list[dict[
         for r in map(json.loads, lines)
         if r["assignments"] == assignments and "looseness" in r  # not of an earlier version
     }
-    registrars = [Registrar(load_config(None, [*assignments, *look])) for look in LOOKS]
+    registrars = [Registrar(load_config(None, [*assignments, *look])) for look in looks]
     with out.open("a") as file:
         for number, (scene, source, target, T, related) in enumerate(pairs):
             for look, registrar in enumerate(registrars):
@@ -122,6 +138,8 @@ def measure(pairs: list[Drawn], out: Path, assignments: list[str]) -> list[dict[
                     "right": right,
                     "status": result.status,
                     "lead": lead_of(result),
+                    "margin": result.evidence.get("margin"),
+                    "heard": "verdict" in result.evidence,
                     "support": result.num_inliers / max(result.num_correspondences, 1),
                     "observability": result.evidence.get("observability", 0.0),
                     "looseness": result.evidence.get("looseness", 1000.0),
@@ -132,7 +150,7 @@ def measure(pairs: list[Drawn], out: Path, assignments: list[str]) -> list[dict[
                 file.flush()
                 if number % 25 == 0:
                     print(f"{number} of {len(pairs)}", flush=True)
-    return [known[(source, target, look)] for _, source, target, *_ in pairs for look in range(len(LOOKS))]
+    return [known[(source, target, look)] for _, source, target, *_ in pairs for look in range(len(looks))]
 
 
 def lead_of(result: RegistrationResult) -> float:
@@ -149,6 +167,15 @@ def held(record: dict[str, Any]) -> Information:
     return Information(unknown, unknown[0, :3], record["observability"], 0, record["looseness"])
 
 
+def inputs_of(record: dict[str, Any], *, second_look: bool) -> FloatArray:
+    """(7,) or (2,) what the fit is a function of."""
+    evidence, lead, support = Evidence(**record["evidence"]), record["lead"], record["support"]
+    if not second_look:
+        return confidence_inputs(evidence, lead, support, held(record))
+    said = confidence_score(evidence, lead, support, held(record), heard=record["heard"])
+    return margin_inputs(float(np.log(said) - np.log1p(-said)), record["margin"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folders", nargs="+")
@@ -156,8 +183,10 @@ def main() -> None:
     parser.add_argument("--unrelated", type=int, default=250)
     parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", default="runs/confidence.jsonl")
+    parser.add_argument("--second-look", action="store_true", help="the fit of answers of a second look")
     parser.add_argument("--measured", action="store_true", help="fit on what OUT holds; register nothing")
     given = parser.parse_args()
+    looks, bands = (AS_USERS_DO, LOW_BANDS) if given.second_look else (LOOKS, BANDS)
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import log_loss, roc_auc_score
     from sklearn.model_selection import GroupKFold, cross_val_predict
@@ -168,12 +197,12 @@ def main() -> None:
         records = [json.loads(line) for line in Path(given.out).read_text().splitlines()]
         records = [r for r in records if r["assignments"] == given.assignments and "looseness" in r]
     else:
-        pairs = draw(given.folders, given.pairs, given.unrelated)
-        records = measure(pairs, Path(given.out), given.assignments)
+        pairs = draw(given.folders, given.pairs, given.unrelated, bands)
+        records = measure(pairs, Path(given.out), given.assignments, looks)
     records = [r for r in records if r["evidence"] is not None]
-    X = np.array(
-        [confidence_inputs(Evidence(**r["evidence"]), r["lead"], r["support"], held(r)) for r in records]
-    )
+    if given.second_look:
+        records = [r for r in records if r["margin"] is not None]
+    X = np.array([inputs_of(r, second_look=given.second_look) for r in records])
     y = np.array([r["right"] for r in records])
     related = np.array([r["related"] for r in records])
     weight = np.where(related, 1.0, UNRELATED_WEIGHT)
@@ -205,7 +234,8 @@ def main() -> None:
     scaler, logistic = model[0], model[1]
     slopes = logistic.coef_[0] / scaler.scale_
     offset = float(logistic.intercept_[0] - slopes @ scaler.mean_)
-    print(f"{', '.join(CONFIDENCE_INPUTS)}: {np.round(slopes, 3).tolist()}")
+    names = ("evidence", "margin") if given.second_look else CONFIDENCE_INPUTS
+    print(f"{', '.join(names)}: {np.round(slopes, 3).tolist()}")
     print(f"offset: {offset:.3f}")
 
 

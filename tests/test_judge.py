@@ -203,6 +203,27 @@ def test_the_networks_verdict_counts_by_the_lead_alone() -> None:
     assert at[0] == at[1] == confidence_score(found, 3.0, 0.05, FIRM, heard=True)
 
 
+def test_the_margin_of_a_second_look_makes_surer_up_to_a_bound() -> None:
+    """One that says nothing, an answer liked less than another, one liked more; and no more than its bound."""
+    found, bounds = Evidence(0.5, 0.5, 0.3, 0.0), expert().confidence.second_look
+    at = [bounds.least_margin - 1, bounds.least_margin, 0.0, 2.0, bounds.most_margin, np.inf]
+    sure = [confidence_score(found, 3.0, 0.05, FIRM, heard=True, margin=m) for m in at]
+    assert sure[0] == sure[1] < sure[2] < sure[3] < sure[4] == sure[5] < 1
+    assert confidence_score(evidence(0.0), 3.0, 0.05, FIRM, margin=4.0) == 0
+    blind = replace(FIRM, sensors_known=False)  # the fit is of scans whose sensors are known
+    without, told = (confidence_score(found, 3.0, 0.05, blind, margin=m) for m in (None, 4.0))
+    assert without == told
+
+
+@pytest.mark.parametrize(("margin", "status"), [(None, "ambiguous"), (0.4, "ambiguous"), (3.0, "ok")])
+def test_a_clear_margin_tells_two_transforms_apart_that_are_liked_alike(
+    margin: float | None, status: str
+) -> None:
+    mine, rival = (scored(evidence(5.0, overlap=0.5), verdict) for verdict in (3.0, 2.5))
+    judged = confidence.judge(mine, rival, 1.2, 0.3, FIRM, DecisionConfig(min_confidence=0.5), margin=margin)
+    assert judged.status == status
+
+
 def test_confidence_rises_with_support_and_falls_with_overlap_at_equal_evidence() -> None:
     by_support = [confidence_score(evidence(0.2), 2.0, x, FIRM) for x in (0, 0.005, 0.02, 0.3)]
     by_overlap = [confidence_score(evidence(0.2, overlap=x), 2.0, 0.05, FIRM) for x in (0.1, 0.3, 0.9)]

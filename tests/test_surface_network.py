@@ -202,15 +202,15 @@ def test_a_right_transform_that_was_proposed_badly_is_refined_before_the_costly_
 
 
 class Contrary(Scorer):
-    """Likes what lies far off."""
+    """Likes what lies far off, and the rest by a factor of ``other``."""
 
-    def __init__(self, T: np.ndarray) -> None:
-        self._T = T
+    def __init__(self, T: np.ndarray, other: float) -> None:
+        self._T, self._other = T, other
 
     def about(self, pair: Pair) -> PairScorer:
         def say(transforms: np.ndarray) -> list[Belief]:
             shifts = [motions_apart(self._T, T, np.zeros(3))[0] for T in transforms]
-            return [Belief(1.0 if shift > 5 else 1e-6) for shift in shifts]
+            return [Belief(1.0 if shift > 5 else self._other) for shift in shifts]
 
         return say
 
@@ -243,7 +243,12 @@ def test_scorers_of_the_second_look_choose_and_leave_score_and_lead_alone(sample
         selection.add([Hypothesis(T), Hypothesis(beside)])
         return selection.decide(4, 4)
 
-    alone, chosen = decided({}), decided({"contrary": Contrary(T)})
-    assert motions_apart(T, chosen.T_target_source, np.zeros(3))[0] > 5
-    assert set(chosen.answer.scores) == {"surfaces"}
-    assert chosen.judgement.status == alone.judgement.status == "ambiguous"
+    alone = decided({})
+    assert alone.judgement.status == "ambiguous" and alone.margin is None
+    for other, status in ((0.5, "ambiguous"), (1e-6, "low_confidence")):
+        chosen = decided({"contrary": Contrary(T, other)})
+        assert motions_apart(T, chosen.T_target_source, np.zeros(3))[0] > 5
+        assert set(chosen.answer.scores) == {"surfaces"}
+        assert chosen.lead == pytest.approx(1 / alone.lead, rel=0.1)
+        assert chosen.margin == pytest.approx(-np.log(other))
+        assert chosen.judgement.status == status  # told apart only by one who prefers it by far

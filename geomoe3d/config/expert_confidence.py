@@ -9,6 +9,9 @@ from pydantic import Field
 from geomoe3d.config.section import Section, constant
 
 _FIT = "scripts/fit_confidence.py; docs/measurements.md holds what came of it on real scans"
+_SECOND_FIT = (
+    "scripts/fit_confidence.py --second-look; docs/measurements.md holds what came of it on real scans"
+)
 _REAL_PAIRS = "right answers on real scans"
 Slope = Annotated[float, Field(ge=-1000, le=1000)]
 Slopes = tuple[Slope, Slope, Slope, Slope, Slope, Slope, Slope]
@@ -25,6 +28,17 @@ class ConfidenceFit(Section):
         "log evidence, log lead, log overlap, log observability, log looseness, log support, free-space violation",
         _FIT,
     )
+
+
+class MarginFit(Section):
+    """A logistic function of what the fit of the evidence says and of the surface network's margin."""
+
+    offset: float = constant(0.0, "logit", (-50, 50), "where both are 0", _SECOND_FIT)
+    evidence: float = constant(1.0, "logit per logit", (0, 10), "of what the evidence says", _SECOND_FIT)
+    margin: float = constant(0.0, "-", (0, 10), "of the margin, see `judge`", _SECOND_FIT)
+    most_evidence: float = constant(8.0, "logit", (0, 50), "for and against, beyond which it says no more")
+    least_margin: float = constant(-2.5, "-", (-50, 0), "below which less says no more")
+    most_margin: float = constant(4.0, "-", (0, 50), "above which more says no more")
 
 
 class ConfidenceExpert(Section):
@@ -50,6 +64,8 @@ class ConfidenceExpert(Section):
     surfaces_alone_no_sensor: ConfidenceFit = ConfidenceFit(
         offset=-1.976, slopes=(1.813, 3.895, -5.902, 1.117, -2.994, 1.447, 0.0)
     )
+    # Of clouds that were described again, with the network's margin; of scans whose sensors are known.
+    second_look: MarginFit = MarginFit(offset=-0.265, evidence=0.52, margin=1.067)
     fitted_prior: float = constant(
         0.88,
         "probability",
@@ -89,6 +105,14 @@ class ConfidenceExpert(Section):
         (0, 100),
         "verdicts of the network closer than this do not tell two transforms apart",
         "of two places that are both right it has preferred one by up to 3",
+    )
+    told_apart: float = constant(
+        2.5,
+        "-",
+        (0, 100),
+        "margin of the scorers that help to choose from which two transforms that clouds and network like alike are told "
+        "apart",
+        "at most 0.4 between two places that are both right",
     )
     most_sliding: float = constant(0.3, "probability", (0, 1), "most confidence where the source can slide")
     most_doubted: float = constant(

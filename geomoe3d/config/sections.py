@@ -136,6 +136,15 @@ class SecondLookConfig(Section):
         description="an answer found with that descriptor is ok from this confidence on, which was fitted for the "
         "first one; decision.min_confidence counts where it is higher",
     )
+    checked_below: float = Field(
+        0.985,
+        ge=0,
+        le=1,
+        description="an ok answer of less confidence is shown to the scorers of the second look too; 0: none is",
+    )
+    num_checked: int = Field(
+        3, ge=0, le=64, description="so many clearly different hypotheses are refined and shown to them beside it"
+    )
     scorers: tuple[str, ...] = Field(
         ("surface_network",),
         description="who helps to choose among the refined hypotheses of clouds that were described again: "

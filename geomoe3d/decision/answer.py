@@ -41,6 +41,7 @@ class Decision:
         alternative: the best clearly different one, or None.
         lead: score of the answer over that of the alternative, see `lead_over`.
         information, judgement: see their classes.
+        margin: by how much the scorers of a second look prefer the answer, see `judge`; None: nobody was asked.
         hypotheses: all that were considered, best first, before refinement.
         scale: how large the source is beside the target under the answer, where that was measured.
         accuracy: how closely the clouds lie on each other, where that was measured.
@@ -54,6 +55,7 @@ class Decision:
     hypotheses: tuple[Hypothesis, ...] = ()
     scale: Scale | None = None
     accuracy: Accuracy | None = None
+    margin: float | None = None
 
     @classmethod
     def failed(cls, reason: str) -> Decision:
@@ -221,6 +223,7 @@ def _evidence(decision: Decision, pair: Pair) -> dict[str, float]:
         **({} if opinion is None else {"verdict": opinion.verdict}),
         "surface_score": evidence.surface_score,
         "score": decision.answer.score,
+        **({} if decision.margin is None else {"margin": decision.margin}),
         "observability": decision.information.observability,
         "looseness": decision.information.looseness,
         **({} if scale is None else {"scale_ratio": scale.ratio, "scale_sigma": scale.sigma}),

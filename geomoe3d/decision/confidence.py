@@ -43,6 +43,7 @@ def judge(
     information: Information,
     config: DecisionConfig,
     num_matches: int | None = None,
+    margin: float | None = None,
 ) -> Judgement:
     """Decide whether an answer may be believed.
 
@@ -54,6 +55,8 @@ def judge(
         information: of the answer.
         config: thresholds.
         num_matches: the correspondences of which the support is a share; None: not counted.
+        margin: logarithm of the factor by which the scorers that help to choose prefer the answer to the best clearly
+            different candidate; None: nobody was asked.
 
     Returns:
         ``ambiguous`` where the surfaces let the source slide, or where the answer would be likely but another
@@ -61,7 +64,9 @@ def judge(
         ``ok``.
     """
     limits, evidence, heard = expert().confidence, evidence_of(answer), opinion_of(answer) is not None
-    confidence = confidence_score(evidence, lead, support, information, heard=heard, prior=config.prior)
+    confidence = confidence_score(
+        evidence, lead, support, information, heard=heard, prior=config.prior, margin=margin
+    )
     notes = []
     if evidence.overlap < limits.low_overlap:
         notes.append(f"the scans share little surface: overlap {100 * evidence.overlap:.0f} %")
@@ -88,8 +93,9 @@ def judge(
         rival is not None
         and evidence_of(rival).surface_score >= config.ambiguity_ratio * evidence.surface_score
     )
-    unsure = confidence < config.min_confidence or _hardly_told_apart(answer, rival)
-    close = lead < 1 / config.ambiguity_ratio or (alike and unsure)
+    told_apart = margin is not None and margin >= limits.told_apart
+    unsure = confidence < config.min_confidence or (_hardly_told_apart(answer, rival) and not told_apart)
+    close = (lead < 1 / config.ambiguity_ratio and not told_apart) or (alike and unsure)
     if close and alone >= limits.likely:
         notes.append(
             f"a clearly different transform does {min(100 / lead, 100):.0f} % as well; see the alternative, "
@@ -186,6 +192,17 @@ def confidence_inputs(
     )
 
 
+def margin_inputs(strength: float, margin: float) -> FloatArray:
+    """(2,) what the fit of the evidence says, and the margin, both logits and bounded."""
+    bounds = expert().confidence.second_look
+    return np.array(
+        [
+            np.clip(strength, -bounds.most_evidence, bounds.most_evidence),
+            np.clip(margin, bounds.least_margin, bounds.most_margin),
+        ]
+    )
+
+
 def confidence_score(
     evidence: Evidence,
     lead: float,
@@ -194,11 +211,13 @@ def confidence_score(
     *,
     heard: bool = False,
     prior: float | None = None,
+    margin: float | None = None,
 ) -> float:
     """P(the answer is right) in [0, 1], a logistic function of `confidence_inputs`; 0 without evidence.
 
     ``heard``: whether a network was asked about the answer; ``prior``: P(a pair overlaps) before it is looked at, None
-    for that of the mix that the coefficients were fitted on; see `judge` for the other arguments.
+    for that of the mix that the coefficients were fitted on; see `judge` for the other arguments. With a margin, what
+    that function says and the margin are the inputs of a second one.
 
     Source of the prior: Bayes' rule, which adds to the logit what the prior's differs by.
     """
@@ -207,6 +226,11 @@ def confidence_score(
     fit = expert().confidence.fit(heard=heard, sensors_known=information.sensors_known)
     inputs = confidence_inputs(evidence, lead, support, information)
     strength = fit.offset + inputs @ np.array(fit.slopes)
+    if margin is not None and information.sensors_known:
+        second = expert().confidence.second_look
+        strength = second.offset + np.array([second.evidence, second.margin]) @ margin_inputs(
+            strength, margin
+        )
     if prior is not None:
         fitted = expert().confidence.fitted_prior
         strength += np.log(prior / (1 - prior)) - np.log(fitted / (1 - fitted))

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.config import RegistrationConfig, expert
+from geomoe3d.config import DecisionConfig, RegistrationConfig, expert
 from geomoe3d.decision.answer import Decision
+from geomoe3d.decision.choosers import Choosers
 from geomoe3d.decision.confidence import Judgement, judge, lead_over
 from geomoe3d.decision.information import measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
@@ -43,8 +44,9 @@ class Selection:
         refiner: polishes the best hypotheses of the pair; one that several selections share polishes none twice.
         config: of the registration.
         clock: told of the stages score, refine and decide.
-        choosing: scorers that are asked about refined candidates alone. They help to choose the answer; its score, lead
-            and confidence know nothing of them.
+        choosing: scorers that are asked about refined candidates alone. They help to choose the answer, and by how much
+            they prefer it to the best clearly different candidate, the margin, makes the confidence; score and lead
+            know nothing of them.
     """
 
     def __init__(
@@ -58,12 +60,13 @@ class Selection:
     ) -> None:
         clock("score")
         self._pair, self._scorers, self._config, self._clock = pair, scorers, config, clock
-        self._source, self._choosing = pair.clouds[0], choosing
+        self._source, self._choosers = pair.clouds[0], Choosers(choosing, pair, self._differ)
         surfaces = scorers.get(SURFACES, SurfaceScorer())
         self._bound: dict[str, PairScorer] = {SURFACES: surfaces.about(pair)}
         self._refiner = refiner
         self._first: Hypothesis | None = None
         self._guess: FloatArray | None = None
+        self._candidates: list[Hypothesis] = []
         self.hypotheses: list[Hypothesis] = []
         """All of them, best first."""
 
@@ -107,17 +110,56 @@ class Selection:
             self._clock("decide")
             return Decision.failed("no rigid transform aligns three non-collinear correspondences")
         rival, lead = self._rival(answer)
+        margin = self._choosers.margin(answer, [*self._candidates, rival])
+        return self._judged(answer, rival, lead, margin, self._config.decision)
+
+    def check(
+        self,
+        decision: Decision,
+        choosing: Mapping[str, Scorer],
+        pair: Pair,
+        limits: DecisionConfig,
+        count: int,
+    ) -> Decision:
+        """A decision of this selection, judged anew with what others say of its answer.
+
+        Args:
+            decision: whose answer it is.
+            choosing: asked about the answer and the hypotheses that are clearly different.
+            pair: the same clouds with the features that they want.
+            limits: by which it is judged.
+            count: so many different hypotheses, the best ones, are refined and asked about.
+        """
+        answer = decision.answer
+        if answer is None:
+            return decision
+        self._clock("refine")
+        different = (h for h in self.hypotheses if self._differ(answer, h))
+        others = [self._refine(h) for h in distinct(different, self._source, self._shift, count)]
+        margin = Choosers(choosing, pair, self._differ).margin(answer, [*others, decision.alternative])
+        return self._judged(answer, decision.alternative, decision.lead, margin, limits)
+
+    def _judged(
+        self,
+        answer: Hypothesis,
+        rival: Hypothesis | None,
+        lead: float,
+        margin: float | None,
+        limits: DecisionConfig,
+    ) -> Decision:
         self._clock("decide")
         information = measure_information(
             answer.T_target_source, *self._pair.clouds, self._pair.inlier_threshold
         )
         support, count = self._support(answer), len(self._pair.matched)
-        judgement = judge(answer, rival, lead, support, information, self._config.decision, count)
+        judgement = judge(answer, rival, lead, support, information, limits, count, margin)
         if judgement.status == "ok" and answer.note is not None and self._pair.matched.viewpoints is None:
             # Scans of two places that were ok had not been refined either.
             most = expert().selection.most_unrefined
             judgement = Judgement("low_confidence", (_UNREFINED, *judgement.reasons), most)
-        decision = Decision(answer, rival, lead, information, judgement, tuple(self.hypotheses))
+        decision = Decision(
+            answer, rival, lead, information, judgement, tuple(self.hypotheses), margin=margin
+        )
         for note in (answer.note, self._overruled(answer)):
             decision = decision if note is None else decision.with_note(note)
         return decision
@@ -181,14 +223,12 @@ class Selection:
             return self._refine(self._first)
         asked = [h for h in self.hypotheses if all(name in h.asked for name in selective)]
         best = distinct(asked or self.hypotheses, self._source, self._shift, num_refined)
-        candidates = [self._refine(h) for h in best]
-        values = np.array([candidate.score for candidate in candidates])
-        transforms = np.array([candidate.T_target_source for candidate in candidates])
-        for scorer in self._choosing.values():
-            said = scorer.about(self._pair)(transforms)
-            if len(said) == len(candidates):  # else it says nothing of this pair
-                values *= [score.factor for score in said]
-        return candidates[int(values.argmax())]
+        self._candidates = [self._refine(h) for h in best]
+        values = np.array([candidate.score for candidate in self._candidates])
+        liked = self._choosers.likings(self._candidates)
+        if liked is not None:
+            values *= np.exp(liked)
+        return self._candidates[int(values.argmax())]
 
     def _refine_best(self, count: int) -> None:
         """Refine the ``count`` best distinct hypotheses by the clouds, and add what comes of them: costly scorers are

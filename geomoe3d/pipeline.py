@@ -210,7 +210,7 @@ class Pipeline:
     def matched_again(
         self, pair: Pair, described: Clouds, places: Places, clock: StageClock
     ) -> tuple[Pair, Pair]:
-        """The pair with ``described`` clouds, see `described_again`: with their matches alone, and with those of both."""
+        """The pair with ``described`` clouds, with their matches alone, and with those of both."""
         own = self.match(described, places, clock, draw=1)  # other points than the first one's
         return own, self.together((pair, own), places)
 

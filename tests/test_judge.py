@@ -312,3 +312,14 @@ def test_the_formula_of_the_confidence_in_the_docs_has_its_coefficients(name: st
     assert printed == pytest.approx([fit.offset, *fit.slopes], abs=0.00501)
     names = re.findall(r"ln\((\w+)", formula)
     assert names == ["surface_score", "lead", "overlap", "observability", "looseness", "support"]
+
+
+def test_the_formula_of_the_margin_in_the_docs_has_its_coefficients() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "concepts.md").read_text()
+    printed = re.search(r"after a second look: sigmoid\((\S+) \+ (\S+) logit \+ (\S+) m\)", text)
+    assert printed is not None
+    fit = expert().confidence.second_look
+    assert [float(x) for x in printed.groups()] == pytest.approx(
+        [fit.offset, fit.evidence, fit.margin], abs=0.00501
+    )
+    assert f"between {fit.least_margin} and {fit.most_margin:g}" in " ".join(text.split())

@@ -19,8 +19,9 @@ from geomoe3d.errors import CheckpointError
 from geomoe3d.features.base import with_features
 from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.features.learned import LearnedDescriptor
-from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart
+from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, rotation_error_deg
 from geomoe3d.pipeline import Pipeline, resolved
+from geomoe3d.registration import Registrar
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import Belief, PairScorer, Scorer
 from geomoe3d.scoring.surface_channels import NUM_CHANNELS, NUM_POINTS, RAW, SurfaceChannels, channels_of
@@ -252,3 +253,28 @@ def test_scorers_of_the_second_look_choose_and_leave_score_and_lead_alone(sample
         assert chosen.lead == pytest.approx(1 / alone.lead, rel=0.1)
         assert chosen.margin == pytest.approx(-np.log(other))
         assert chosen.judgement.status == status  # told apart only by one who prefers it by far
+
+
+def test_an_answer_that_is_ok_by_little_is_checked(tmp_path):
+    """By the surface network where it is below the limit; one that everybody there denies is looked at again."""
+    source, target, T = make_sample_pair(seed=0)
+    denies = tmp_path / "denies.py"
+    denies.write_text(
+        "import numpy as np\n"
+        "from geomoe3d.scoring.base import Belief, Scorer\n"
+        "class Denies(Scorer):\n"
+        "    def about(self, pair):\n"
+        "        return lambda transforms: [Belief(np.exp(-2.0 if k == 0 else 2.0)) for k in range(len(transforms))]\n"
+    )
+
+    def answer(*settings):
+        registrar = Registrar(load_config(None, ["voxel_size=0.08", *settings]))
+        return registrar.register(source.file_points, target.file_points)
+
+    never, always = (answer(f"second_look.checked_below={least}") for least in (0, 1))
+    assert never.status == always.status == "ok"
+    assert "margin" not in never.evidence and always.evidence["margin"] > 1
+    assert never.num_correspondences == always.num_correspondences  # the second descriptor proposed nothing
+    denied = answer("second_look.checked_below=1", f"second_look.scorers=[{denies}:Denies]")
+    assert denied.num_correspondences > always.num_correspondences
+    assert rotation_error_deg(denied.T_target_source, T) < 2

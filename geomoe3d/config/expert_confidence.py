@@ -110,8 +110,7 @@ class ConfidenceExpert(Section):
         2.5,
         "-",
         (0, 100),
-        "margin of the scorers that help to choose from which two transforms that clouds and network like alike are told "
-        "apart",
+        "margin from which transforms that clouds and network like alike are told apart",
         "at most 0.4 between two places that are both right",
     )
     most_sliding: float = constant(0.3, "probability", (0, 1), "most confidence where the source can slide")

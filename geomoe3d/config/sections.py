@@ -143,7 +143,10 @@ class SecondLookConfig(Section):
         description="an ok answer of less confidence is shown to the scorers of the second look too; 0: none is",
     )
     num_checked: int = Field(
-        3, ge=0, le=64, description="so many clearly different hypotheses are refined and shown to them beside it"
+        3,
+        ge=0,
+        le=64,
+        description="so many clearly different hypotheses are refined and shown to them beside it",
     )
     scorers: tuple[str, ...] = Field(
         ("surface_network",),

@@ -48,4 +48,6 @@ class Choosers:
         """
         different = [h for h in others if h is not None and self._differ(answer, h)]
         liked = self.likings([answer, *different])
-        return None if liked is None else float(liked[0] - liked[1:].max(initial=-np.inf if different else 0.0))
+        return (
+            None if liked is None else float(liked[0] - liked[1:].max(initial=-np.inf if different else 0.0))
+        )

@@ -137,6 +137,8 @@ class Selection:
         different = (h for h in self.hypotheses if self._differ(answer, h))
         others = [self._refine(h) for h in distinct(different, self._source, self._shift, count)]
         margin = Choosers(choosing, pair, self._differ).margin(answer, [*others, decision.alternative])
+        if margin is None:
+            return decision
         return self._judged(answer, decision.alternative, decision.lead, margin, limits)
 
     def _judged(

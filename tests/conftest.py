@@ -86,6 +86,15 @@ def scanned_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[s
 
 
 @pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    """A folder with scans and a table of their pairs for a batch, and the true poses."""
+    from small_scans import write_batch
+
+    folder = tmp_path_factory.mktemp("scans")
+    return folder, write_batch(folder)
+
+
+@pytest.fixture(scope="module")
 def posed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set of posed scans with all its pairs."""
     from posed_scans import write_posed

@@ -54,3 +54,28 @@ def write_room(folder: Path) -> tuple[Path, dict[str, np.ndarray]]:
     np.save(folder / "scan_8.npy", cut(scene(77), 0.0, 3.0, seed=8)[0])
     (folder / "scan_9.ply").write_text("ply\nnothing\n")
     return folder, poses
+
+
+def write_table(path, pairs):
+    """A table of pairs for a batch: id, and the names of two scans beside it."""
+    lines = [f"{name},{source}.npy,{target}.npy" for name, source, target in pairs]
+    path.write_text("\n".join(["id,source,target", *lines]) + "\n")
+
+
+def write_batch(folder):
+    """a.npy, b.npy, c.npy, a broken file and a table of five pairs in a folder; the true poses."""
+    points = scene()
+    poses = {}
+    for number, (name, low, high) in enumerate((("a", 0.0, 3.0), ("b", 0.8, 3.6), ("c", 0.4, 3.2))):
+        part, poses[name] = cut(points, low, high, seed=number)
+        np.save(folder / f"{name}.npy", part)
+    (folder / "broken.ply").write_bytes(b"ply\nnothing of use\n")
+    write_table(folder / "pairs.csv", [("ab", "a", "b"), ("ac", "a", "c"), ("bc", "b", "c")])
+    with (folder / "pairs.csv").open("a") as stream:
+        stream.write("bad,a.npy,broken.ply\ngone,missing.ply,b.npy\n")
+    return poses
+
+
+def everything(folder):
+    """The content of every file in a folder."""
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

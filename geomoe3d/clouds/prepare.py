@@ -125,8 +125,8 @@ def check_cloud(cloud: PointCloud) -> None:
         EmptyCloudError: fewer than 3 points, or all points equal.
     """
     if len(cloud) < _MIN_POINTS:
-        held = counted(len(cloud), "point")
-        raise EmptyCloudError(f"'{cloud.name}' holds {held}; a rigid transform needs at least {_MIN_POINTS}")
+        held = f"'{cloud.name}' holds {counted(len(cloud), 'point')}"
+        raise EmptyCloudError(f"{held}; a rigid transform needs at least {_MIN_POINTS}")
     if not extents(cloud.points).any():
         raise EmptyCloudError(
             f"'{cloud.name}': all {len(cloud)} points are equal to {cloud.file_points[0].tolist()}; "

@@ -1,0 +1,114 @@
+"""What a map is made of: voxels, features of some of its points, normals with signs, votes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geomoe3d.features.base import with_features
+from geomoe3d.features.learned import LearnedDescriptor
+from geomoe3d.features.multiscale import MultiscaleDescriptor
+from geomoe3d.features.pyramid import pyramid
+from geomoe3d.geometry.se3 import make_transform, transform_points
+from geomoe3d.maps.facing import both_sides, facing_alike
+from geomoe3d.maps.level import Compared
+from geomoe3d.maps.places import Query, Window
+from geomoe3d.maps.voxels import VoxelSums
+from geomoe3d.types import PreparedCloud
+
+UTM = np.array([583394.0, 5283100.0, 498.0])
+
+
+def test_of_a_small_scan_also_second_choices_propose():
+    rng = np.random.default_rng(11)
+    points, T = rng.uniform(-1, 1, (60, 3)), make_transform(Rotation.random(rng=3).as_matrix(), np.ones(3))
+    normals, features = rng.normal(size=(60, 3)), rng.normal(size=(60, 65)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    alike = features + rng.normal(0, 0.02, features.shape).astype(np.float32)
+    alike /= np.linalg.norm(alike, axis=1, keepdims=True)
+    there = Compared(  # each point has its partner, and elsewhere one that is more like it
+        np.concatenate([transform_points(T, points), rng.uniform(-2, 2, (60, 3))]),
+        np.concatenate([normals @ T[:3, :3].T, normals]),
+        np.concatenate([alike, features]),
+    )
+    level = SimpleNamespace(compared=there, voxel_size=0.02)
+    window = Window(np.ones(3), np.arange(120), 1.0)
+    best = Query(Compared(points, normals, features), level).motions(window, 1)[0]
+    np.testing.assert_allclose(best.T_target_source, T, atol=1e-3)
+
+
+def test_voxels_are_those_of_the_whole_in_whatever_pieces():
+    points = np.random.default_rng(1).uniform(-3, 3, (3000, 3))
+    whole = VoxelSums.empty(0.5, np.zeros(3)).added(points)
+    pieces = VoxelSums.empty(0.5, np.zeros(3))
+    for part in np.array_split(points, 7):
+        pieces = pieces.added(part)
+    np.testing.assert_array_equal(pieces.keys, whole.keys)
+    np.testing.assert_allclose(pieces.points, whole.points, atol=1e-12)
+    cells, index = np.unique(np.floor(points / 0.5), axis=0, return_inverse=True)
+    means = [points[index.ravel() == k].mean(0) for k in range(len(cells))]
+    np.testing.assert_allclose(whole.points, means, atol=1e-12)
+    coarse = VoxelSums.empty(1.0, np.zeros(3)).added(points)
+    np.testing.assert_array_equal(whole.coarser().keys, coarse.keys)
+    np.testing.assert_allclose(whole.coarser().points, coarse.points, atol=1e-12)
+
+
+def test_the_edge_for_a_count_is_the_one_that_gives_it():
+    rng = np.random.default_rng(7)
+    points = rng.uniform(0, 8, (40_000, 3)) * (1, 1, 0)  # a plane fills voxels like 1 / size^2
+    voxels = VoxelSums.empty(0.05, np.zeros(3)).added(points)
+    for count in (200, 900, 4000):
+        edge = voxels.edge_for(count)
+        assert len(VoxelSums.empty(edge, np.zeros(3)).added(points)) == pytest.approx(count, rel=0.15)
+    assert voxels.edge_for(10**6) == voxels.edge
+
+
+def test_a_part_of_a_map_is_what_lies_near_some_places():
+    points = np.random.default_rng(8).uniform(-3, 3, (3000, 3))
+    whole = VoxelSums.empty(0.5, np.zeros(3)).added(points)
+    places = np.array([[-2.0, 0, 0], [2.0, 1, 0]])
+    part = whole.within(places, 1.0)
+    away = np.linalg.norm(whole.points[:, None] - places, axis=2).min(axis=1)
+    np.testing.assert_array_equal(part.keys, whole.keys[away <= 1.0])
+    np.testing.assert_array_equal(part.points, whole.points[away <= 1.0])
+
+
+def test_some_points_are_described_as_all_are():
+    rng = np.random.default_rng(9)
+    points = rng.uniform(0, 1, (900, 3)) * (3, 3, 0.3)
+    normals = rng.normal(size=(900, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = PreparedCloud(points, normals, None, 0.1, None, np.zeros(3))
+    rows = np.arange(5, 900, 7)
+    some = LearnedDescriptor().at(pyramid(cloud), rows)
+    np.testing.assert_allclose(some, LearnedDescriptor()(cloud)[rows], atol=1e-5)
+
+
+def test_signs_run_along_a_sphere():
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    flipped = points * rng.choice([-1.0, 1.0], (2000, 1))
+    outward = np.einsum("ij,ij->i", facing_alike(points, flipped), points) > 0
+    assert outward.all() or not outward.any()
+
+
+def test_both_sides_are_the_features_of_turned_normals():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(0, 1, (800, 3)) * (3, 3, 0.3)
+    normals = rng.normal(size=(800, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def features(signed):
+        cloud = PreparedCloud(points, signed, None, 0.1, None, np.zeros(3))
+        return with_features(cloud, MultiscaleDescriptor()).features
+
+    # The histograms count pairs in bins; one at a bin's edge may fall to either side.
+    off = np.abs(both_sides(features(normals)) - features(-normals)).max(axis=1)
+    assert np.median(off) < 1e-5
+    assert np.median(np.abs(features(normals) - features(-normals)).max(axis=1)) > 0.01
+    assert both_sides(np.zeros((0, 99), dtype=np.float32)).shape == (0, 99)

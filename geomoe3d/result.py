@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 Status = Literal["ok", "low_confidence", "ambiguous", "failed"]
 
-_ARRAYS = {"T_target_source": (4, 4), "information_matrix": (6, 6), "information_center": (3,)}
-
 
 @dataclass(frozen=True, eq=False, repr=False)  # arrays have no single truth value: compare what matters
 class RegistrationResult:
@@ -349,8 +347,9 @@ class RegistrationResult:
         """
         try:
             data = json.loads(text)
-            for name, shape in _ARRAYS.items():
-                data[name] = _array(data[name], shape)
+            data["T_target_source"] = _array(data["T_target_source"], (4, 4))
+            data["information_matrix"] = _array(data["information_matrix"], (6, 6))
+            data["information_center"] = _array(data["information_center"], (3,))
             for name in ("inlier_threshold", "voxel_size"):
                 data[name] = float("nan") if data[name] is None else float(data[name])
             if data["alternative"] is not None:

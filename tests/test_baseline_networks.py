@@ -119,11 +119,9 @@ def test_one_batch_is_learnt_by_heart(
     rate: float,
     most_steps: int,
     least: float,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("geomoe3d.training.overfit.LEARNING_RATE", rate)
     config = config_of(batch_size=2, network={"kind": kind, **SMALL[kind], **changes})
-    _, f1 = overfit_one_batch(config, most_steps)
+    _, f1 = overfit_one_batch(config, most_steps, learning_rate=rate)
     assert f1 > least
 
 

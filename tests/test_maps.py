@@ -10,7 +10,7 @@ from generated_buildings import GRID, first_room, other_room, scanned, view
 
 import geomoe3d
 from geomoe3d import Map
-from geomoe3d.cli.errors import BAD_INPUT, OK, run
+from geomoe3d.cli.errors import ExitCode, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.raw import RawCloud
@@ -235,19 +235,21 @@ def test_index_and_locate_in_the_shell(rooms, scan, tmp_path, monkeypatch, capfd
     np.save("first.npy", scanned(first, UTM, 1))
     np.save("scan.npy", scan[0])
     grid = ("--voxel-size", GRID)
-    assert ask("index", "other.npy", "house.map", *grid) == OK
-    assert ask("index", "other.npy", "first.npy", "house.map", *grid) == OK
+    assert ask("index", "other.npy", "house.map", *grid) == ExitCode.OK
+    assert ask("index", "other.npy", "first.npy", "house.map", *grid) == ExitCode.OK
     assert "2 clouds (1 new)" in capfd.readouterr().out
-    assert ask("locate", "scan.npy", "house.map", *grid, "--json", "--output", "poses.tum") == OK
+    assert ask("locate", "scan.npy", "house.map", *grid, "--json", "--output", "poses.tum") == ExitCode.OK
     told = json.loads(capfd.readouterr().out)
     assert told["status"] == "ok"
     assert told["scan"] == "scan"
     assert shift(np.array(told["places"][0]["T_map_scan"]), scan[1]) < 0.05
     line = [line for line in (tmp_path / "poses.tum").read_text().splitlines() if line[0] != "#"]
     np.testing.assert_allclose([float(word) for word in line[0].split()[1:4]], scan[1][:3, 3], atol=0.05)
-    assert ask("locate", "scan.npy", "house.map", *grid, "--near", "1,2", "--within", "3") == BAD_INPUT
+    assert (
+        ask("locate", "scan.npy", "house.map", *grid, "--near", "1,2", "--within", "3") == ExitCode.BAD_INPUT
+    )
     assert "three numbers" in capfd.readouterr().err
-    assert ask("locate", "scan.npy", "nowhere.map") == BAD_INPUT
+    assert ask("locate", "scan.npy", "nowhere.map") == ExitCode.BAD_INPUT
     assert "there is no map 'nowhere.map'" in capfd.readouterr().err
 
 
@@ -256,14 +258,14 @@ def test_what_is_no_map_is_never_overwritten(tmp_path, monkeypatch, capfd):
     cloud = np.random.default_rng(0).uniform(0, 1, (500, 3))
     for name in ("one.npy", "two.npy"):
         np.save(name, cloud)
-    assert ask("index", "one.npy", "two.npy", "--fresh") == BAD_INPUT
+    assert ask("index", "one.npy", "two.npy", "--fresh") == ExitCode.BAD_INPUT
     assert "ends in .map, found 'two.npy'" in capfd.readouterr().err
     np.testing.assert_array_equal(np.load("two.npy"), cloud)
-    assert ask("locate", "house.map", "one.npy") == BAD_INPUT
+    assert ask("locate", "house.map", "one.npy") == ExitCode.BAD_INPUT
     assert "'house.map' is a map" in capfd.readouterr().err
     (tmp_path / "mine.map").write_text("roads and rivers")
     for more in ((), ("--fresh",)):
-        assert ask("index", "one.npy", "mine.map", *more) == BAD_INPUT
+        assert ask("index", "one.npy", "mine.map", *more) == ExitCode.BAD_INPUT
         assert "no map of geomoe3d" in capfd.readouterr().err
     assert (tmp_path / "mine.map").read_text() == "roads and rivers"
 
@@ -281,7 +283,7 @@ def test_poses_are_never_written_over_a_map_or_a_scan(tmp_path, monkeypatch, cap
         ("poses.json", ".tum"),
         ("guess.txt", "also an input"),
     ):
-        assert ask(*locate, output) == BAD_INPUT
+        assert ask(*locate, output) == ExitCode.BAD_INPUT
         assert said in capfd.readouterr().err
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -302,7 +304,7 @@ def test_an_empty_folder_is_named(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     for words in (("index", "empty", "out.map"), ("locate", "empty", "out.map")):
-        assert ask(*words) == BAD_INPUT
+        assert ask(*words) == ExitCode.BAD_INPUT
         assert "'empty' holds no clouds" in capfd.readouterr().err
     assert not (tmp_path / "out.map").exists()
 
@@ -313,7 +315,10 @@ def test_a_sequence_goes_on_after_a_scan_that_cannot_be_read(house, scan, tmp_pa
     (tmp_path / "scans").mkdir()
     np.save("scans/a.npy", scan[0])
     np.save("scans/b.npy", np.full((10, 3), np.nan))
-    assert ask("locate", "scans", "house.map", "--voxel-size", GRID, "--output", "poses.tum") == BAD_INPUT
+    assert (
+        ask("locate", "scans", "house.map", "--voxel-size", GRID, "--output", "poses.tum")
+        == ExitCode.BAD_INPUT
+    )
     told = capfd.readouterr()
     assert "1 of 2 ok" in told.out
     assert "scans per second" in told.out

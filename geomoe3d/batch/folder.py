@@ -27,8 +27,6 @@ TABLE_HEAD = "id,status,confidence,overlap,"
 PAGE_MARK = '<meta name="generator" content="geomoe3d batch">'
 
 _KIND = "geomoe3d batch "
-_HEAD_BYTES = 4096  # marks stand in the first lines
-_LONGEST_NAME = 255  # bytes, of nearly every file system
 _TRANSFORM_HEAD = re.compile(  # the rows stand behind the remarks in batches of old
     r"(?:[^#\n]*\n){0,4}# maps SOURCE \(.*\) into TARGET \(.*\): p_target = (?:[\d.e+-]+ )?R p_source \+ t\r?\n"
     r"# status \w+, confidence [\d.]+\r?\n(?:# pair (.*?)\r?\n)?(?:[^#]|$)"
@@ -109,9 +107,10 @@ def _check_files(place: Path, names: dict[str, str], is_own: Callable[[Path], bo
         raise InputError(f"{foreign(place)}, {what}")
     for name, file in names.items():
         length = len(file.encode())
-        if length > _LONGEST_NAME:
+        longest = 255  # bytes, of nearly every file system
+        if length > longest:
             raise InputError(
-                f"the id '{name}' makes a file name of {counted(length, 'byte')}, at most {_LONGEST_NAME} are "
+                f"the id '{name}' makes a file name of {counted(length, 'byte')}, at most {longest} are "
                 f"possible; give shorter ones in the column id, {what}"
             )
         path = place / file
@@ -246,6 +245,7 @@ def _head(path: Path) -> bytes:
     """The first bytes of a file; none where it cannot be read."""
     try:
         with path.open("rb") as stream:
-            return stream.read(_HEAD_BYTES)
+            # Marks stand in the first lines.
+            return stream.read(4096)
     except OSError:
         return b""

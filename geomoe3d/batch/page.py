@@ -34,8 +34,6 @@ from geomoe3d.visual.templates import render
 from geomoe3d.visual.thumbnail import pair_thumbnail
 from geomoe3d.visual.upright import upright_axes
 
-MAX_PICTURES = 2000
-_MAX_POINTS = 12_000
 _WIDTH, _HEIGHT = 280, 150
 _UNDRAWN = "no picture: one of the surest"
 
@@ -76,7 +74,7 @@ def render_batch_page(
     order = sorted(
         range(len(rows)), key=lambda k: (outcomes[k].result is not None, outcomes[k].confidence, k)
     )
-    drawn = set(order[:MAX_PICTURES])
+    drawn = set(order[:2000])  # pictures: more make a page that browsers are slow with
     # Pairs of one target are drawn one after the other, so that it is read once.
     pictures: dict[int, tuple[str, str]] = {}
     for k in sorted(drawn, key=lambda k: (rows[k].target, rows[k].source)):
@@ -136,7 +134,7 @@ def _points(path: str) -> tuple[FloatArray, FloatArray]:
     """Some points of a file in its coordinates, and axes in which it looks upright."""
     points = load_points(path).file_points
     rng = np.random.default_rng(0)
-    points = points[thin(points, _MAX_POINTS, rng)]
+    points = points[thin(points, 12_000, rng)]
     return points, upright_axes(points, rng)[0]
 
 

@@ -28,7 +28,6 @@ MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range
 """Sixteen columns of an initial value, row by row."""
 
 _COLUMNS = ("source", "target", "id", "initial", *MATRIX_COLUMNS)
-_NEARLY = 0.82  # of difflib: one letter wrong, missing or exchanged; 'source_id' and 'ids' have less
 
 PairLike = Sequence[Any]
 _EXPECTED = "(source, target) or (source, target, first guess)"
@@ -203,7 +202,8 @@ def _check_columns(path: Path, columns: list[str]) -> None:
             )
     known = {name.casefold(): name for name in _COLUMNS}
     for name in columns:
-        close = get_close_matches(name.casefold(), known, n=1, cutoff=_NEARLY)
+        # 0.82 of difflib: one letter wrong, missing or exchanged; 'source_id' and 'ids' have less.
+        close = get_close_matches(name.casefold(), known, n=1, cutoff=0.82)
         if close and name not in _COLUMNS:
             raise FormatError(
                 f"'{path}' has the column '{name}', which is nearly '{known[close[0]]}'; name it so, or "

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, scale_option, worker_options
+from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
     from geomoe3d.config import RegistrationConfig
 
-_SHOWN = 20
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red", "error": "red"}
 
 
@@ -80,25 +80,26 @@ def command(
         )
     if not quiet:
         click.echo(table(report), color=False if os.environ.get("NO_COLOR") else None)
-    context.exit(0 if report.ok else NOT_SURE)
+    context.exit(0 if report.ok else ExitCode.NOT_SURE)
 
 
 def table(report: BatchReport) -> str:
     """Counts by status, then the pairs that are not ok, the least sure first."""
     total = len(report.outcomes)
     before = f", {report.kept:,} of them before" if report.kept else ""
-    lines = [f"{total:,} pair{'s' * (total != 1)}{before}; results in {report.folder / 'results.jsonl'}", ""]
+    lines = [f"{counted(total, 'pair')}{before}; results in {report.folder / 'results.jsonl'}", ""]
     for status, count in report.counts().items():
         word = status.replace("_", " ") if status != "error" else "not registered"
         lines.append(f"  {click.style(word, fg=_COLORS[status]):24} {count:>7,}  {count / total:6.1%}")
     doubtful = sorted((o for o in report.outcomes if o.status != "ok"), key=lambda o: (o.confidence, o.id))
     if doubtful:
         lines.append("")
-    width = min(40, max((len(outcome.id) for outcome in doubtful[:_SHOWN]), default=0))
-    for outcome in doubtful[:_SHOWN]:
+    shown = doubtful[:20]
+    width = min(40, max((len(outcome.id) for outcome in shown), default=0))
+    for outcome in shown:
         reason = outcome.error if outcome.result is None else "; ".join(outcome.result.reasons[:1])
         name = outcome.id if len(outcome.id) <= width else "…" + outcome.id[-(width - 1) :]
         lines.append(f"  {name:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
-    if len(doubtful) > _SHOWN:
-        lines.append(f"  and {len(doubtful) - _SHOWN:,} more that are not ok")
+    if len(doubtful) > len(shown):
+        lines.append(f"  and {len(doubtful) - len(shown):,} more that are not ok")
     return "\n".join(lines)

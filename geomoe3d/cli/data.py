@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, refuse_bare_settings, renamed, renamed_verb, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, refuse_bare_settings, renamed, renamed_verb, traceback_option
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
@@ -60,14 +60,14 @@ def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None
             "(at most 1)\n"
             + ("usable" if truth.usable else "not usable: the cameras are not those of the photographs")
         ))  # fmt: skip
-        context.exit(0 if truth.usable else BAD_INPUT)
+        context.exit(0 if truth.usable else ExitCode.BAD_INPUT)
     with progress_bar("fragments", quiet=as_json) as advance:
         report = check_folder(root, open_files=not quick, progress=advance)
     if as_json:
         click.echo(json.dumps({**asdict(report), "usable": report.usable}, default=str))
     else:
         _print(report)
-    context.exit(0 if report.usable else BAD_INPUT)
+    context.exit(0 if report.usable else ExitCode.BAD_INPUT)
 
 
 def _print(report: CheckReport) -> None:
@@ -313,7 +313,7 @@ def features(
         f"{counted(report.num_pairs, 'pair')}), "
         f"{report.kept} kept, in {out}"
     )
-    context.exit(0 if report.made or report.kept else BAD_INPUT)
+    context.exit(0 if report.made or report.kept else ExitCode.BAD_INPUT)
 
 
 @command.command(context_settings=HELP)
@@ -343,7 +343,7 @@ def transforms(context: click.Context, features: str, out: str, pairs: int, seed
     for line in report.failed:
         click.echo(f"failed: {line}", err=True)
     click.echo(f"{counted(report.made, 'shard')} made, {report.kept} kept, in {out}")
-    context.exit(BAD_INPUT if report.failed else 0)
+    context.exit(ExitCode.BAD_INPUT if report.failed else 0)
 
 
 renamed_verb(command, "motions", "transforms")

@@ -6,7 +6,7 @@ import json
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 
 _COLORS = {"ok": "green", "missing": "yellow", "broken": "red"}
 
@@ -27,4 +27,4 @@ def command(context: click.Context, as_json: bool) -> None:
         click.echo(json.dumps(doctor.as_json(findings), indent=2))
     else:
         click.echo(doctor.report(findings, lambda text, state: click.style(text, fg=_COLORS[state])))
-    context.exit(0 if doctor.is_healthy(findings) else BAD_INPUT)
+    context.exit(0 if doctor.is_healthy(findings) else ExitCode.BAD_INPUT)

@@ -12,6 +12,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
+from enum import IntEnum
 from typing import Any, TypeVar
 
 import click
@@ -19,7 +20,17 @@ import click
 from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.runtime.home import ensure_home
 
-OK, FAULT, BAD_INPUT, NOT_SURE, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 3, 130, 141
+
+class ExitCode(IntEnum):
+    """How a verb ended."""
+
+    OK = 0
+    FAULT = 1
+    BAD_INPUT = 2
+    NOT_SURE = 3
+    INTERRUPTED = 130
+    PIPE_CLOSED = 141
+
 
 HELP = {"help_option_names": ["-h", "--help"]}
 """Click's settings of every command."""
@@ -57,7 +68,7 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
             wanted = context.meta  # shared with the contexts of the verbs
             with context:
                 command.invoke(context)
-            code = OK
+            code: int = ExitCode.OK
         except click.exceptions.Exit as stop:
             code = stop.exit_code
         sys.stdout.flush()
@@ -65,13 +76,13 @@ def run(command: click.Command, name: str, arguments: Sequence[str] | None = Non
     except BrokenPipeError:
         # What Python still holds for stdout must go nowhere, or it complains on its way out.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return PIPE_CLOSED
+        return ExitCode.PIPE_CLOSED
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted", err=True)
-        return INTERRUPTED
+        return ExitCode.INTERRUPTED
     except click.ClickException as error:
         error.show()
-        return BAD_INPUT
+        return ExitCode.BAD_INPUT
     except Exception as error:
         if wanted[_TRACEBACK]:
             traceback.print_exc()
@@ -91,7 +102,7 @@ def command_line() -> str:
 def _explain(error: Exception, shown: bool) -> int:
     if isinstance(error, GeoMoE3DError):
         click.echo(f"error: {error}", err=True)
-        return BAD_INPUT
+        return ExitCode.BAD_INPUT
     if isinstance(error, MemoryError):
         message = "out of memory; a larger --voxel-size needs less"
     else:
@@ -99,7 +110,7 @@ def _explain(error: Exception, shown: bool) -> int:
         message = f"internal error: {type(error).__name__}{': ' if text else ''}{text}"
     hint = "" if shown else "; --traceback (or GEOMOE3D_TRACEBACK=1) shows where"
     click.echo(f"{message}\nThis is a fault of geomoe3d, not of your input{hint}.", err=True)
-    return FAULT
+    return ExitCode.FAULT
 
 
 def renamed(old: str, new: str) -> Callable[[F], F]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, command_line, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, command_line, traceback_option
 from geomoe3d.cli.parts import method_part_options
 from geomoe3d.runtime.words import counted
 
@@ -275,7 +275,7 @@ def _predict(
         made, absent = made + report.made + report.kept, len(report.absent)
     if not made:
         click.echo("nothing was predicted", err=True)
-        click.get_current_context().exit(BAD_INPUT if absent else 0)
+        click.get_current_context().exit(ExitCode.BAD_INPUT if absent else 0)
 
 
 def _score(study: Path, *, raw: bool) -> list[ScoredRun]:

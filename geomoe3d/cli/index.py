@@ -16,8 +16,6 @@ from geomoe3d.runtime.words import counted
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
 
-_KEPT_EVERY = 60.0  # seconds after which what was read so far is written
-
 
 @click.command(context_settings=HELP, short_help="Index a large cloud once, to find scans in it.")
 @click.argument("inputs", metavar="CLOUDS... OUT.map", nargs=-1, required=True)
@@ -73,7 +71,8 @@ def command(
                 view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
                 sensor = None if view is None else view + cloud.origin
                 made = made.with_cloud(scan.path, T_map_cloud=where[number], sensor=sensor)
-            if time.monotonic() - kept > _KEPT_EVERY:
+            # A minute after the last time, what was read so far is written.
+            if time.monotonic() - kept > 60.0:
                 made.save(out, force=True)
                 kept = time.monotonic()
         made.describe(progress=stage)

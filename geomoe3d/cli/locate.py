@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import BAD_INPUT, HELP, NOT_SURE, OK, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import check_outputs, part_option
 from geomoe3d.cli.parts import configuration_options
 
@@ -111,8 +111,9 @@ def command(
     if output is not None:
         _write(output, found, force)
     if any(location is None for _, location in found):
-        context.exit(BAD_INPUT)
-    context.exit(OK if all(location is not None and location.ok for _, location in found) else NOT_SURE)
+        context.exit(ExitCode.BAD_INPUT)
+    sure = all(location is not None and location.ok for _, location in found)
+    context.exit(ExitCode.OK if sure else ExitCode.NOT_SURE)
 
 
 def _numbers(text: str) -> list[float]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, worker_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
@@ -16,8 +16,6 @@ from geomoe3d.runtime.words import counted
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
     from geomoe3d.multiway.model import SceneModel
-
-_SHOWN = 20
 
 
 @click.command(context_settings=HELP, short_help="Register many scans into one model.")
@@ -146,7 +144,7 @@ def command(
         )
     if not quiet:
         click.echo(summary(model), color=False if os.environ.get("NO_COLOR") else None)
-    context.exit(0 if model.ok else NOT_SURE)
+    context.exit(0 if model.ok else ExitCode.NOT_SURE)
 
 
 def summary(model: SceneModel) -> str:
@@ -168,8 +166,8 @@ def summary(model: SceneModel) -> str:
             lines.append(click.style(f"    {group.bent}", fg="yellow"))
     if model.unplaced:
         lines.append("not placed:")
-    for name, reason in list(model.unplaced.items())[:_SHOWN]:
-        lines.append(f"  {name}: {reason}")
-    if len(model.unplaced) > _SHOWN:
-        lines.append(f"  and {len(model.unplaced) - _SHOWN:,} more, see poses.json")
+    shown = list(model.unplaced.items())[:20]
+    lines += [f"  {name}: {reason}" for name, reason in shown]
+    if len(model.unplaced) > len(shown):
+        lines.append(f"  and {len(model.unplaced) - len(shown):,} more, see poses.json")
     return "\n".join(lines)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import check_outputs
 from geomoe3d.runtime.words import counted
 
@@ -108,7 +108,8 @@ def homography(context: click.Context, /, **given: Any) -> None:
     import numpy as np
 
     from geomoe3d.images.cameras import Camera
-    from geomoe3d.images.homography import THRESHOLD, find_homography
+    from geomoe3d.images.config import HOMOGRAPHY
+    from geomoe3d.images.homography import find_homography
 
     matches, sizes = _matches(given)
     rays = np.hstack([
@@ -116,8 +117,8 @@ def homography(context: click.Context, /, **given: Any) -> None:
     ])  # fmt: skip
     weights, verdict = _weights(given, matches, rays)
     result = find_homography(
-        matches.pixels, weights=weights, estimator=given["estimator"], threshold=given["threshold"] or THRESHOLD,
-        seed=given["seed"],
+        matches.pixels, weights=weights, estimator=given["estimator"],
+        threshold=given["threshold"] or HOMOGRAPHY.threshold, seed=given["seed"],
     )  # fmt: skip
     _tell(context, given, matches, result.inliers, result.residuals, result.status, list(result.reasons), verdict,
           {"H": result.H})  # fmt: skip
@@ -140,13 +141,13 @@ def _matches(given: dict[str, Any]) -> tuple[Matches, list[tuple[int, int]]]:
 def _weights(given: dict[str, Any], matches: Matches, rays: FloatArray) -> tuple[FloatArray, Verdict | None]:
     import numpy as np
 
-    from geomoe3d.images.features import LOOSE_RATIO
+    from geomoe3d.images.config import KEYPOINTS
     from geomoe3d.images.network import ImageNetwork
 
     which = given["matches"] or ("loose" if given["weights"] else "distinct")
     chosen = {
         "all": np.ones(len(matches), dtype=bool), "mutual": matches.mutual, "distinct": matches.distinct(),
-        "loose": matches.distinct(LOOSE_RATIO),
+        "loose": matches.distinct(KEYPOINTS.loose_ratio),
     }[which]  # fmt: skip
     if given["weights"] is None:
         return chosen.astype(np.float64), None
@@ -219,4 +220,4 @@ def _tell(
             expert=expert,
             force=given["force"],
         )
-    context.exit(0 if status == "ok" else NOT_SURE)
+    context.exit(0 if status == "ok" else ExitCode.NOT_SURE)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, NOT_SURE, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import check_outputs, part_option
 from geomoe3d.cli.parts import configuration_options, scale_option
 
@@ -167,7 +167,7 @@ def command(
         from geomoe3d.visual.window import show_window
 
         show_window(explanation.view(unit))
-    context.exit(0 if result.ok else NOT_SURE)
+    context.exit(0 if result.ok else ExitCode.NOT_SURE)
 
 
 def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: bool, unit: str) -> None:

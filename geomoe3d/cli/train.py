@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import (
-    HELP,
-    INTERRUPTED,
-    NOT_SURE,
-    refuse_bare_settings,
-    renamed,
-    traceback_option,
-)
+from geomoe3d.cli.errors import HELP, ExitCode, refuse_bare_settings, renamed, traceback_option
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
@@ -86,7 +79,7 @@ def _train(settings: TrainConfig, folder: Path, new: bool, quiet: bool) -> int:
         return 0
     if not summary.finished:
         click.echo(f"stopped at step {summary.step}; the same command goes on from there", err=True)
-        return INTERRUPTED
+        return ExitCode.INTERRUPTED
     best = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in summary.best.items())
     click.echo(
         f"{counted(summary.step, 'step')}, {summary.pairs_per_s:.1f} pairs/s, {summary.skipped} skipped"
@@ -108,7 +101,7 @@ def _overfit(settings: TrainConfig, quiet: bool) -> int:
     click.echo(f"F1 {f1:.4f} after {steps} steps on one batch of {settings.batch_size} pairs", err=False)
     if not reached:
         click.echo(f"did not reach {TARGET_F1}: network, losses or data are at fault", err=True)
-    return 0 if reached else NOT_SURE
+    return 0 if reached else ExitCode.NOT_SURE
 
 
 def _stop_gently(run: Any) -> None:
@@ -116,7 +109,7 @@ def _stop_gently(run: Any) -> None:
 
     def stop(number: int, frame: object) -> None:
         if run.stop:
-            sys.exit(INTERRUPTED)
+            sys.exit(ExitCode.INTERRUPTED)
         run.stop = True
 
     for number in (signal.SIGINT, signal.SIGTERM):

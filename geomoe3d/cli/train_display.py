@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from geomoe3d.training.config import TrainConfig
 
 _SHOWN = ("loss", "classification", "regression", "balance", "precision", "recall", "f1")
-_KEPT_SHARE = 0.95  # of the mean at every step
 
 
 class Display:
@@ -52,7 +51,8 @@ class Display:
             old, new = self._means.get(name, math.nan), measures[name]
             if math.isfinite(new):  # a skipped step must not blot out all later means
                 old = new if math.isnan(old) else old
-                new = _KEPT_SHARE * old + (1 - _KEPT_SHARE) * new
+                kept = 0.95  # of the mean at every step
+                new = kept * old + (1 - kept) * new
             self._means[name] = new if math.isfinite(new) else old
         shown = "  ".join(f"{name} {value:.3f}" for name, value in self._means.items())
         self._advance(step, self._steps, f"{shown}  {pairs_per_s:.1f} pairs/s  {skipped} skipped")

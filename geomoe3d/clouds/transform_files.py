@@ -38,7 +38,6 @@ _BY_SUFFIX = {
     **{".tum": "tum", ".kitti": "kitti"},
 }
 TRANSFORM_SUFFIXES = tuple(_BY_SUFFIX)
-_LARGEST_TEXT = 1 << 24  # bytes; a transform is some hundred
 
 transform_text = matrix_text
 
@@ -188,10 +187,11 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
     path = Path(path)
     try:
         with path.open("rb") as handle:
-            data = handle.read(_LARGEST_TEXT)
+            largest = 1 << 24  # bytes; a transform is some hundred
+            data = handle.read(largest)
         if data[:6] == b"\x93NUMPY":
             T = _of_npy(data)
-        elif b"\0" in data or len(data) == _LARGEST_TEXT:
+        elif b"\0" in data or len(data) == largest:
             raise FormatError("it is no text")
         else:
             T = parse_transform(data.decode("utf-8-sig", errors="replace"))

@@ -17,7 +17,6 @@ from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 
 _FRAGMENTS = 4
-_POINTS = 6000
 
 
 def draw_contact_sheet(scenes: list[Path], path: Path, *, force: bool = False) -> None:
@@ -52,7 +51,7 @@ def draw_contact_sheet(scenes: list[Path], path: Path, *, force: bool = False) -
 
 
 def _thinned(points: FloatArray) -> FloatArray:
-    return points[:: max(1, len(points) // _POINTS)]
+    return points[:: max(1, len(points) // 6000)]
 
 
 def _plan(axis: Any, name: str, clouds: list[FloatArray], poses: FloatArray) -> None:

@@ -27,8 +27,6 @@ from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.types import Float32Array, PointCloud
 
-VOXEL_SIZE = 0.05
-
 
 @dataclass
 class DescribeReport:
@@ -51,7 +49,7 @@ class DescribeReport:
     skipped: list[str] = field(default_factory=list)
 
 
-def describe_fragment(cloud: PointCloud, voxel_size: float = VOXEL_SIZE) -> tuple[Float32Array, Float32Array]:
+def describe_fragment(cloud: PointCloud, voxel_size: float = 0.05) -> tuple[Float32Array, Float32Array]:
     """Voxel points (n, 3) and unit features (n, 33) float32 of a fragment whose sensor is at its origin.
 
     Raises:
@@ -71,7 +69,7 @@ def describe_collection(
     scenes: tuple[str, ...] | None = None,
     split: str | None = None,
     min_overlap: float = 0.1,
-    voxel_size: float = VOXEL_SIZE,
+    voxel_size: float = 0.05,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> DescribeReport:

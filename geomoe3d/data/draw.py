@@ -25,9 +25,6 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.matching.nearest import match
 from geomoe3d.types import BoolArray, Correspondences, FloatArray, PreparedCloud
 
-ENDLESS = 1 << 40
-_TRIES = 4
-
 
 class DrawSettings(Section):
     """Which pairs are drawn, and how."""
@@ -133,15 +130,17 @@ class FragmentPool:
         return len(self.overlap)
 
     def __len__(self) -> int:
-        return ENDLESS
+        # Stands for: without end.
+        return 2**40
 
     def __getitem__(self, index: int) -> DrawnPair:
         if not 0 <= index < len(self):
             raise IndexError(f"pair {index} of {len(self)}")
         rng = np.random.default_rng([self.seed, 3, index])
         pair = None
-        for attempt in range(2 * _TRIES):
-            if attempt % _TRIES == 0:  # another pair only when fresh keypoints did not help
+        tries = 4
+        for attempt in range(2 * tries):
+            if attempt % tries == 0:  # another pair only when fresh keypoints did not help
                 band = self._bands[int(rng.choice(len(self._bands), p=self._shares))]
                 chosen = int(band[rng.integers(len(band))])
             pair = self.draw(chosen, rng)
@@ -163,7 +162,7 @@ class FragmentPool:
         i, j = (int(k) for k in scene.pair[place])
         share = self.settings.whole_share
         whole = keypoints is None and share > 0 and rng.random() < share
-        count = keypoints if keypoints is not None else _EVERY if whole else self._count(rng)
+        count = keypoints if keypoints is not None else 2**30 if whole else self._count(rng)
         return draw_pair(
             scene.fragment(i),
             scene.fragment(j),
@@ -231,7 +230,6 @@ def draw_pair(
     return DrawnPair(found, labels, T_target_source, voxel_size, kept is not None)
 
 
-_EVERY = 1 << 30
 _MATCHING = MatchingConfig(name="one_way", neighbors=1, max_correspondences=1_000_000)
 
 

@@ -22,7 +22,6 @@ from geomoe3d.runtime.words import counted
 from geomoe3d.types import Float32Array, FloatArray
 
 OVERLAP_GRID = 0.025
-_MIN_VALID_SHARE = 0.01
 
 
 @dataclass
@@ -145,7 +144,7 @@ def fuse_run(
                 skipped.append(f"{frame.path.name}: {depth.shape} pixels, the others have {size}")
                 continue
             share = float(np.mean(depth > 0))
-            if share < _MIN_VALID_SHARE:
+            if share < 0.01:  # of the pixels of a depth image
                 skipped.append(f"{frame.path.name}: depth in {share:.1%} of the pixels only")
                 continue
             if not pose:

@@ -24,8 +24,6 @@ from geomoe3d.data.settings import SynthesisSettings
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import Float32Array, FloatArray
 
-_ORBIT_NOISE = (0.0005, 0.004)  # of the diagonal
-
 
 @dataclass
 class Recorded:
@@ -81,7 +79,8 @@ def record_orbit(rng: np.random.Generator, scene: Scene, settings: SynthesisSett
     recorded = Recorded(scene)
     low, high = scene.solids.bounds
     diagonal = float(np.linalg.norm(high - low))
-    noise = diagonal * float(rng.uniform(*_ORBIT_NOISE))
+    # Shares of the diagonal.
+    noise = diagonal * float(rng.uniform(0.0005, 0.004))
     for _ in range(settings.fragments_per_scene):
         yaw, pitch = float(rng.uniform(0, 360)), float(rng.normal(0, 25))
         poses, parts = [], []

@@ -23,7 +23,6 @@ from geomoe3d.types import Float32Array, FloatArray
 CONVENTIONS = ("7scenes", "tum", "plain")
 _INTRINSICS = ("camera-intrinsics.txt", "K.txt", "intrinsics.txt", "intrinsic_depth.txt")
 _PER_METRE = {"7scenes": 1000.0, "tum": 5000.0, "plain": 1000.0}
-_MAX_SKEW = 0.02
 
 
 @dataclass(frozen=True)
@@ -204,7 +203,7 @@ def _check_pose(values: FloatArray, name: str, skipped: list[str]) -> FloatArray
         skipped.append(f"{name}: the pose is not finite")
         return None
     R = values[:3, :3]
-    if not is_rotation(R, _MAX_SKEW):
+    if not is_rotation(R, 0.02):
         skipped.append(f"{name}: the pose holds no rotation (det {np.linalg.det(R):.3f})")
         return None
     return make_transform(project_to_so3(R), np.array(values[:3, 3]))
@@ -251,9 +250,6 @@ def _plain(folder: Path, skipped: list[str]) -> list[Frame]:
     return frames
 
 
-_TUM_GAP_S = 0.02
-
-
 def _tum(folder: Path, skipped: list[str]) -> list[Frame]:
     """TUM: the pose nearest in time, at most 20 ms away, as its tools associate them."""
     from scipy.spatial.transform import Rotation
@@ -277,10 +273,9 @@ def _tum(folder: Path, skipped: list[str]) -> list[Frame]:
         right = int(np.clip(np.searchsorted(poses[:, 0], time), 1, len(poses) - 1)) if len(poses) > 1 else 0
         near = min((max(right - 1, 0), right), key=lambda k: abs(poses[k, 0] - time))
         gap = abs(poses[near, 0] - time)
-        if gap > _TUM_GAP_S:
-            skipped.append(
-                f"{path.name}: the nearest pose is {gap:.3f} s away, at most {_TUM_GAP_S} s is used"
-            )
+        most = 0.02
+        if gap > most:
+            skipped.append(f"{path.name}: the nearest pose is {gap:.3f} s away, at most {most} s is used")
             continue
         row = poses[near]
         if not np.isfinite(row).all():

@@ -27,7 +27,6 @@ _ALLOWED = {
 }
 _ARRAY_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")
 _NUMERIC_MODULES = ("numpy.core.numeric", "numpy._core.numeric")
-_TORCH_STREAM = 0x1950A86A20F9469CFC6C
 
 
 def load_pickle(path: str | Path) -> Any:
@@ -43,7 +42,8 @@ def load_pickle(path: str | Path) -> Any:
             return _load_torch_zip(path)
         with path.open("rb") as stream:
             first = _load(stream)
-            if not isinstance(first, int) or first != _TORCH_STREAM:
+            # The number that a file of torch.save begins with.
+            if not isinstance(first, int) or first != 0x1950A86A20F9469CFC6C:
                 return first
             _load(stream), _load(stream)  # protocol version, description of the machine
             return _load(stream)

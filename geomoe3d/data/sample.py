@@ -25,8 +25,6 @@ from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import FloatArray, PointCloud
 
 _CAMERA = Camera(320, 240, 262.5)  # 63 by 49 degrees
-_NEAR, _FAR = 0.4, 4.5
-_GRID = 0.0125  # one point is kept per voxel of this edge, as fusing the frames of a fragment does
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,8 @@ def _view(
         parts.append(transform_points(inverse(poses[0]) @ pose, points))
         colors.append(color)
     points, color = np.concatenate(parts), np.concatenate(colors)
-    _, first = np.unique(np.floor(points / _GRID).astype(np.int64), axis=0, return_index=True)
+    # One point is kept per voxel of this edge, as fusing the frames of a fragment does.
+    _, first = np.unique(np.floor(points / 0.0125).astype(np.int64), axis=0, return_index=True)
     keep = np.sort(first)
     # As a PLY of a scanner holds them: single precision, 8 bits per colour.
     points = points[keep].astype(np.float32).astype(np.float64)
@@ -140,6 +139,6 @@ def _depth_frame(
     dropped = rng.uniform(size=len(depth)) > np.clip((slope - 0.05) / 0.20, 0, 1)
     sigma = np.clip(0.0015 * np.where(np.isfinite(depth), depth, 0.0) ** 2, 0.003, 0.015)
     noisy = depth + sigma * rng.standard_normal(len(depth))
-    seen = np.isfinite(depth) & (depth > _NEAR) & (depth < _FAR) & ~dropped
+    seen = np.isfinite(depth) & (depth > 0.4) & (depth < 4.5) & ~dropped  # metres
     points: FloatArray = rays[seen] * noisy[seen, None]
     return points, face_colors[hits.triangle[seen]]

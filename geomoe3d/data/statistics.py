@@ -20,8 +20,6 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray
 
 BANDS = (0.1, 0.3, 0.6, 1.01)
-_PLANE_DISTANCE, _PLANE_SHARE, _PLANES = 0.03, 0.1, 5
-_FRAGMENTS, _SEED = 400, 0
 
 
 @dataclass(frozen=True)
@@ -56,14 +54,14 @@ def measure(folder: str | Path, *, max_pairs: int = 3000) -> Statistics:
         InputError: no shards.
         FormatError: a shard is damaged.
     """
-    rng = np.random.default_rng([_SEED, 11])
+    rng = np.random.default_rng([0, 11])
     places = []
     for path in shard_folders(folder):
         scene = open_shard(path)
         places += [(scene, k) for k in range(len(scene.start) - 1)]
-    kept = np.sort(rng.permutation(len(places))[:_FRAGMENTS])
+    kept = np.sort(rng.permutation(len(places))[:400])
     rows = [_of_fragment(places[k][0].fragment(places[k][1])[0], rng) for k in kept]
-    pairs = FragmentPool(folder, PROTOCOL, _SEED)
+    pairs = FragmentPool(folder, PROTOCOL, 0)
     numbers = np.sort(rng.permutation(pairs.num_pairs)[:max_pairs])
     ratios, residuals = [], []
     for number in numbers:
@@ -117,7 +115,8 @@ def plane_share(points: FloatArray, rng: np.random.Generator) -> float:
     A plane counts while it holds at least a tenth of all points.
     """
     rest = points
-    for _ in range(_PLANES):
+    distance = 0.03  # metres
+    for _ in range(5):
         if len(rest) < 3:
             break
         sample = rest[rng.permutation(len(rest))[:500]]
@@ -129,10 +128,10 @@ def plane_share(points: FloatArray, rng: np.random.Generator) -> float:
             break
         normals, origins = normals[usable] / length[usable, None], triples[usable, 0]
         offsets = np.einsum("ij,ij->i", normals, origins)
-        votes = (np.abs(sample @ normals.T - offsets) < _PLANE_DISTANCE).sum(axis=0)
+        votes = (np.abs(sample @ normals.T - offsets) < distance).sum(axis=0)
         best = int(votes.argmax())
-        on_plane = np.abs(rest @ normals[best] - offsets[best]) < _PLANE_DISTANCE
-        if on_plane.sum() < _PLANE_SHARE * len(points):
+        on_plane = np.abs(rest @ normals[best] - offsets[best]) < distance
+        if on_plane.sum() < 0.1 * len(points):
             break
         rest = rest[~on_plane]
     return 1.0 - len(rest) / len(points)

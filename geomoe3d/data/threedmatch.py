@@ -24,7 +24,6 @@ from geomoe3d.types import FloatArray
 BENCHMARKS = ("3DMatch", "3DLoMatch")
 DATA_VARIABLE = "GEOMOE3D_DATA"
 
-_MAX_SKEW = 0.02  # published rotations are up to 5e-4 off
 
 PairTable = list[tuple[int, int, FloatArray]]
 
@@ -313,7 +312,8 @@ def _read_blocks(path: Path, size: int) -> PairTable:
             )
         if not np.isfinite(matrix).all():
             raise FormatError(f"'{path}' line {number}: the entry {i} {j} is not finite")
-        if size == 4 and not is_motion(matrix, _MAX_SKEW):
+        # Published rotations are up to 5e-4 off.
+        if size == 4 and not is_motion(matrix, 0.02):
             raise FormatError(f"'{path}' line {number}: the entry {i} {j} is no rigid transform")
         entries.append((i, j, matrix))
     return entries

@@ -25,7 +25,6 @@ from geomoe3d.evaluation.records import Measure
 from geomoe3d.types import FloatArray, IntArray
 
 RESAMPLES = 2000
-_LEVEL = 0.95
 _BLOCK = 4_000_000
 _UNDEFINED = (math.nan, math.nan)
 
@@ -211,7 +210,7 @@ def _interval(samples: FloatArray, value: float, reflected: bool) -> Interval:
     ordered = np.sort(samples[~np.isnan(samples)])
     if ordered.size == 0:
         return _UNDEFINED
-    tail = (1.0 - _LEVEL) / 2.0 * (ordered.size - 1)
+    tail = (1.0 - 0.95) / 2.0 * (ordered.size - 1)  # intervals of 95 %
     low, high = float(ordered[math.floor(tail)]), float(ordered[ordered.size - 1 - math.floor(tail)])
     if reflected:
         return max(0.0, 2.0 * value - high), max(0.0, 2.0 * value - low)

@@ -25,9 +25,7 @@ TRANSLATION_LIMIT = 0.30
 RMSE_LIMIT = 0.20
 """Metres; the benchmark's RMSE of a right motion is at most this (not strict, as published)."""
 
-_DIGITS = 9
 _Triple = tuple[float, float, float] | tuple[None, None, None]
-_RIGID_TOLERANCE = 1e-2
 
 
 def score_pair(pair: EvaluationPair, prediction: Prediction, *, raw_truth: bool = False) -> PairScore:
@@ -106,7 +104,7 @@ def score_pair(pair: EvaluationPair, prediction: Prediction, *, raw_truth: bool 
 
 def has_motion(T: FloatArray | None) -> bool:
     """Whether an answer (4, 4) is a rigid motion: finite, last row 0 0 0 1, rotation within 0.01 of SO(3)."""
-    return T is not None and is_motion(T, _RIGID_TOLERANCE)
+    return T is not None and is_motion(T, 1e-2)
 
 
 def motion_errors(T: FloatArray | None, T_truth: FloatArray, *, raw: bool = False) -> tuple[float, float]:
@@ -138,8 +136,7 @@ def is_right(
     Errors are compared after rounding to 1e-9, so that a last bit does not decide.
     """
     return (
-        round(rotation_error, _DIGITS) < rotation_limit
-        and round(translation_error, _DIGITS) < TRANSLATION_LIMIT
+        round(rotation_error, 9) < rotation_limit and round(translation_error, 9) < TRANSLATION_LIMIT
         if math.isfinite(rotation_error) and math.isfinite(translation_error)
         else False
     )

@@ -18,8 +18,6 @@ from geomoe3d.types import Correspondences, FloatArray
 
 __all__ = ["PEERS"]
 
-_SMALL_CLOUD = 3000
-
 
 @peer("spectral", "numpy", "numpy", inputs=CORRESPONDENCES)
 def spectral_matching(
@@ -163,7 +161,7 @@ def _has_surface(points: FloatArray, radius: float) -> bool:
 
     Large clouds are not looked at: this is on the peer's clock, and only sparse ones are at fault.
     """
-    if len(points) >= _SMALL_CLOUD:
+    if len(points) >= 3000:
         return True
     from scipy.spatial import KDTree
 

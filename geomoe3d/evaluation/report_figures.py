@@ -20,12 +20,11 @@ from numpy.typing import ArrayLike
 from geomoe3d.evaluation.metrics import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
 from geomoe3d.evaluation.records import Measure, RunScore
 from geomoe3d.runtime.words import counted
-from geomoe3d.types import FloatArray
+from geomoe3d.types import FloatArray, IntArray
 
 NUM_COLORS = 8
 """Run colours of the style sheet; further runs repeat them with broken lines."""
 NUM_STAGE_COLORS = 16
-MAX_CURVE_POINTS = 200
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 _SOFT, _LINE, _PAPER = "#abcdf0", "#abcdf1", "#abcdf2"
 _VARIABLES = {_SOFT: "var(--soft)", _LINE: "var(--line)", _PAPER: "var(--paper)"}
@@ -255,9 +254,13 @@ def share_below(values: FloatArray, low: float, high: float) -> tuple[FloatArray
     """Points (x, %) of the share of values (n,) up to x, for x from low to high; NaN is not counted."""
     ordered = np.sort(values[~np.isnan(values)])
     inside = ordered[(ordered > low) & (ordered <= high)]
-    keep = np.unique(np.linspace(0, len(inside) - 1, min(len(inside), MAX_CURVE_POINTS)).astype(int))
-    x = np.concatenate([[low], inside[keep], [high]])
+    x = np.concatenate([[low], inside[_some(len(inside))], [high]])
     return x, 100.0 * np.searchsorted(ordered, x, side="right") / len(ordered)
+
+
+def _some(count: int, most: int = 200) -> IntArray:
+    """At most so many rows of a curve, evenly spread: more are not seen."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def _confidence_figures(runs: Sequence[tuple[int, RunScore]]) -> list[Figure]:
@@ -282,8 +285,7 @@ def _confidence_figures(runs: Sequence[tuple[int, RunScore]]) -> list[Figure]:
             sizes = [3.0 + 8.0 * math.sqrt(b.count / most) for b in bins]
             reliable += [Series(run, label, x, y, tips=tips, sizes=sizes)] if bins else []
             curve = 100.0 * np.reshape(calibration.risk_coverage, (-1, 2))
-            keep = np.unique(np.linspace(0, len(curve) - 1, MAX_CURVE_POINTS).astype(int))
-            risky += [Series(run, label, *curve[keep].T)] if len(curve) else []
+            risky += [Series(run, label, *curve[_some(len(curve))].T)] if len(curve) else []
     top = max([1.0, *(float(np.max(one.y)) for one in risky)])
     found = (
         draw(

@@ -37,7 +37,6 @@ from geomoe3d.visual.drawing import camera_fit, spacing_of, thin
 from geomoe3d.visual.templates import render_cloud_page
 from geomoe3d.visual.upright import upright_axes
 
-MAX_POINTS = 3_000
 MAX_TOTAL_POINTS = 400_000
 """Of all clouds of a page, 8 bytes each: with more failures than fit, every cloud is thinned further."""
 
@@ -212,7 +211,7 @@ def _galleries(
         if score is not None:
             chosen.append((benchmark, score, worst_failures(score, num_failures)))
     total = sum(len(failures) for _, _, failures in chosen)
-    max_points = min(MAX_POINTS, MAX_TOTAL_POINTS // max(1, 2 * total))
+    max_points = min(3_000, MAX_TOTAL_POINTS // max(1, 2 * total))
     found = []
     number = 0
     for benchmark, score, failures in chosen:

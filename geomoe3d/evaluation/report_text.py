@@ -32,9 +32,6 @@ from geomoe3d.runtime.words import counted
 
 # ---- the terminal ---------------------------------------------------------------------------------
 
-NATURAL_WIDTH = 118
-_SPLIT_WIDTH = 110
-
 
 def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, color: bool = False) -> str:
     """One table per benchmark and track, one row per run, and below what every run came from.
@@ -48,7 +45,8 @@ def terminal_table(scores: Sequence[RunScore], *, width: int | None = None, colo
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(width=width or NATURAL_WIDTH, color_system="standard" if color else None)
+    # Where nobody says how wide, as wide as all columns need.
+    console = Console(width=width or 118, color_system="standard" if color else None)
     with console.capture() as captured:
         for (benchmark, track), runs in groups_of(scores).items():
             sizes = {pairs_text(run) for run in runs}
@@ -101,7 +99,8 @@ def terminal_comparison(a: RunScore, b: RunScore, found: Comparison) -> str:
 
 
 def _columns(width: int) -> list[slice]:
-    return [slice(None)] if width >= _SPLIT_WIDTH else [slice(0, 6), slice(6, None)]
+    # A table of all columns needs 110 characters.
+    return [slice(None)] if width >= 110 else [slice(0, 6), slice(6, None)]
 
 
 # ---- Markdown -------------------------------------------------------------------------------------

@@ -65,8 +65,6 @@ TITLES = {
 
 STAGE_PREFIX = "stage_"
 OVERLAP_EDGES = tuple(round(0.1 * k, 1) for k in range(11))
-INLIER_RATIO_EDGES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-_QUANTILES = (25, 50, 75, 90)
 _INLIER_MEASURES = ("precision", "recall", "f1", "verified_precision", "verified_recall", "verified_f1")
 
 
@@ -200,7 +198,7 @@ def _errors(scores: Sequence[PairScore]) -> dict[str, Quantity]:
         of_right = np.where(right, values, np.nan)
         quantities[f"{name}_median"] = Quantity(of_right, unit, 0.5)
         quantities[f"{name}_mean"] = Quantity(of_right, unit)
-        for percent in _QUANTILES:
+        for percent in (25, 50, 75, 90):
             quantities[f"{name}_q{percent}"] = Quantity(values, unit, percent / 100.0)
     return quantities
 
@@ -249,7 +247,7 @@ def _curves(scores: Sequence[PairScore], resamples: int, seed: int) -> dict[str,
             "recall_15_by_inlier_ratio",
             "inlier ratio",
             _numbers(s.inlier_ratio for s in scores),
-            INLIER_RATIO_EDGES,
+            (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0),
         ),
     ):
         if np.isnan(values).all():

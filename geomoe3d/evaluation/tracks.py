@@ -31,10 +31,6 @@ from geomoe3d.runtime.sources import source_hash
 from geomoe3d.types import Float32Array, FloatArray
 
 TRACKS = ("1k", "all", "clouds")
-NUM_FIXED = 1000
-_HASHED_BYTES = 65536
-_KEPT_CLOUDS = 8
-_KEPT_FEATURES = 80  # a benchmark scene has at most 66 fragments, 0.7 MB each
 
 
 def needs(track: str) -> str:
@@ -61,8 +57,9 @@ class InputMaker:
     def __init__(self, track: str, benchmark: str, root: str | Path | None = None, *, seed: int = 0) -> None:
         needs(track)
         self.track, self.seed = track, seed
-        self._points = lru_cache(_KEPT_CLOUDS)(_load_points)
-        self._describe = lru_cache(_KEPT_FEATURES)(_describe)
+        self._points = lru_cache(8)(_load_points)
+        # A benchmark scene has at most 66 fragments, 0.7 MB each.
+        self._describe = lru_cache(80)(_describe)
         self._fixed: dict[str, FloatArray] = {}
         self._fixed_scene = ""
         self._published = _published_folder(track, benchmark, root)
@@ -110,7 +107,7 @@ class InputMaker:
             return rows
         digest = hashlib.sha256(pair.id.encode()).digest()
         rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        return rows[np.sort(rng.permutation(len(rows))[:NUM_FIXED])]
+        return rows[np.sort(rng.permutation(len(rows))[:1000])]  # as in the published 1k
 
     def _take_published(self, pair: EvaluationPair) -> FloatArray:
         assert self._published is not None
@@ -137,7 +134,7 @@ def _hash_files(files: Collection[Path]) -> str:
     for path in sorted(files):
         start, size = b"", 0
         with suppress(OSError), path.open("rb") as stream:
-            start, size = stream.read(_HASHED_BYTES), path.stat().st_size
+            start, size = stream.read(65536), path.stat().st_size
         total.update(f"{path.parent.name}/{path.name} {size} ".encode() + hashlib.sha256(start).digest())
     return total.hexdigest()
 

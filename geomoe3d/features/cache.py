@@ -29,10 +29,8 @@ from geomoe3d.runtime.home import ensure_home, folder_for
 from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
 from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
-DEFAULT_MAX_BYTES = 4 * 2**30
 _SUFFIX = ".described.npz"
 _PREPARED_BY = "geomoe3d.clouds.prepare"
-_ABANDONED_SECONDS = 3600.0
 _CONSTANTS = (
     "loading",
     "preparation",
@@ -72,7 +70,7 @@ class FeatureCache:
         OutputError: the folder cannot be made.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+    def __init__(self, folder: str | os.PathLike[str], *, max_bytes: int = 4 * 2**30) -> None:
         if max_bytes <= 0:
             raise InputError(f"a cache of at most {max_bytes} bytes holds nothing; give a positive limit")
         self.folder, self.max_bytes = Path(folder), max_bytes
@@ -119,7 +117,8 @@ class FeatureCache:
                 status = item.stat()
                 if item.name.endswith(_SUFFIX):
                     entries.append((status.st_mtime_ns, status.st_size, Path(item.path)))
-                elif item.name.startswith(".writing-") and time.time() - status.st_mtime > _ABANDONED_SECONDS:
+                # After an hour nobody is writing it any more.
+                elif item.name.startswith(".writing-") and time.time() - status.st_mtime > 3600.0:
                     Path(item.path).unlink(missing_ok=True)
             except FileNotFoundError:  # another process was quicker
                 continue

@@ -31,8 +31,6 @@ NUM_NEIGHBORS = 16
 LEARNED = 32
 DIMENSION = LEARNED + 33
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
-_CHUNK = 256  # points at a time: what they and their neighbours hold stays near a core
-_EPSILON = np.float32(1e-5)  # of torch's layer norm
 
 
 @descriptor("learned")
@@ -118,8 +116,10 @@ class _Network:
         here = self._linear(f"{name}.here", held)
         there = self._linear(f"{name}.there", of_held)
 
+        size = 256  # points at a time: what they and their neighbours hold stays near a core
+
         def part(start: int) -> Float32Array:
-            chunk = slice(start, start + _CHUNK)
+            chunk = slice(start, start + size)
             # Neighbours come first: the largest and the mean over them are then quick to take.
             lie = relations(at.take(chunk), of, rows[chunk]).swapaxes(0, 1)
             seen = self._linear(f"{name}.lie", np.ascontiguousarray(lie))
@@ -128,7 +128,7 @@ class _Network:
             np.maximum(seen, 0, out=seen)
             return np.hstack([seen.max(0), seen.mean(0), held[chunk]])
 
-        joined = np.concatenate(each(part, range(0, len(at), _CHUNK)))
+        joined = np.concatenate(each(part, range(0, len(at), size)))
         return held + self._mlp(f"{name}.out", joined, normalised=True)
 
     def _mlp(self, name: str, x: Float32Array, *, normalised: bool = False) -> Float32Array:
@@ -136,7 +136,8 @@ class _Network:
         x = self._linear(f"{name}.0", x)
         if normalised:
             x -= x.mean(1, keepdims=True)
-            x /= np.sqrt(np.mean(x * x, axis=1, keepdims=True) + _EPSILON)
+            # As torch's layer norm.
+            x /= np.sqrt(np.mean(x * x, axis=1, keepdims=True) + np.float32(1e-5))
             x = x * self._tensors[f"{name}.1.weight"] + self._tensors[f"{name}.1.bias"]
         return self._linear(f"{name}.3" if normalised else f"{name}.2", np.maximum(x, 0))
 

@@ -21,7 +21,6 @@ FACTORS = (1, 2, 4)
 """Edges of the grids, in voxels of the cloud."""
 NUM_RELATIONS = 8
 """Numbers by which `relations` says how one point lies to another."""
-_TINY = np.float32(1e-6)
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def relations(at: Level, of: Level, rows: IntArray) -> Float32Array:
     there = [of.normals[rows, axis] for axis in range(3)]
     here = [at.normals[:, axis, None] for axis in range(3)]
     squared, over_here, over_there = _dot(way, way), _dot(way, here), _dot(way, there)
-    distance = np.sqrt(squared) + _TINY
+    distance = np.sqrt(squared) + np.float32(1e-6)
     (x, y, z), (a, b, c) = way, there
     triple = _dot(here, [y * c - z * b, z * a - x * c, x * b - y * a])
     slopes = over_here / distance, over_there / distance

@@ -15,7 +15,6 @@ from torch.autograd.function import once_differentiable
 
 MIN_MATCHES = 8
 _TINY = 1e-15
-_DAMPING = 1e-6
 
 
 class EssentialFit(NamedTuple):
@@ -130,7 +129,7 @@ class _SmallestDirection(torch.autograd.Function):
         values, vectors = ctx.saved_tensors
         scale = values[..., -1:].abs().clamp(min=_TINY)
         gaps = (values[..., :1] - values) / scale
-        inverse = gaps / (gaps.square() + _DAMPING**2) / scale
+        inverse = gaps / (gaps.square() + 1e-6**2) / scale
         along = (vectors.transpose(-1, -2) @ gradients[0][..., None])[..., 0] * inverse
         side = (vectors @ along[..., None]) @ vectors[..., None, :, 0]
         gradient: Tensor = (side + side.transpose(-1, -2)) / 2

@@ -17,7 +17,6 @@ from torch.autograd.function import once_differentiable
 from geomoe3d.errors import InputError
 
 # Eigenvalues of tr(B) I - B below this share of the largest singular value are damped in the backward pass.
-_DAMPING = 1e-6
 
 
 class RigidFit(NamedTuple):
@@ -129,7 +128,7 @@ class _ProcrustesRotation(torch.autograd.Function):
         # tr(B) I - B has the eigenvectors V and, as eigenvalues, sums of two signed singular values.
         scale = torch.where(signed[..., :1] > 0, signed[..., :1], 1.0)
         eigenvalues = (signed.sum(-1, keepdim=True) - signed) / scale
-        inverse = eigenvalues / (eigenvalues.square() + _DAMPING**2)
+        inverse = eigenvalues / (eigenvalues.square() + 1e-6**2)
         y = (V * (inverse / scale)[..., None, :]) @ (V.transpose(-1, -2) @ g[..., None])
         gradient: Tensor = -R.transpose(-1, -2) @ _cross_matrix(y[..., 0])
         return gradient

@@ -10,9 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from geomoe3d.errors import InputError
 from geomoe3d.types import FloatArray
 
-_MOTION_TOLERANCE = 0.01  # published poses are up to 5e-4 off
-_LAST_ROW_TOLERANCE = 1e-6
-
 
 def make_transform(R: NDArray[np.floating[Any]], t: NDArray[np.floating[Any]]) -> FloatArray:
     """(..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
@@ -101,7 +98,7 @@ def is_motion(T: FloatArray, tolerance: float) -> bool:
     return (
         T.shape == (4, 4)
         and bool(np.isfinite(T).all())
-        and bool(np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() <= _LAST_ROW_TOLERANCE)
+        and bool(np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() <= 1e-6)
         and is_rotation(T[:3, :3], tolerance)
     )
 
@@ -128,11 +125,12 @@ def check_motion(T: ArrayLike) -> FloatArray:
             "a transform must be 16 finite numbers of shape (4, 4), found NaN or infinities in it"
         )
     R = matrix[:3, :3]
-    if not is_rotation(R, _MOTION_TOLERANCE):
+    tolerance = 0.01  # published poses are up to 5e-4 off
+    if not is_rotation(R, tolerance):
         off = _off_rotation(R)
-        what = "mirrors" if off <= _MOTION_TOLERANCE else f"is {off:.3g} off a rotation"
+        what = "mirrors" if off <= tolerance else f"is {off:.3g} off a rotation"
         raise InputError(
-            f"the matrix is no rigid transform: its linear part {what} (at most {_MOTION_TOLERANCE}); scale and "
+            f"the matrix is no rigid transform: its linear part {what} (at most {tolerance}); scale and "
             "shear are not estimated"
         )
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:

@@ -9,12 +9,10 @@ import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.images.cameras import ImageScene, relative_pose
-from geomoe3d.images.features import LONGER_SIDE, Keypoints, detect, match
+from geomoe3d.images.config import KEYPOINTS, TRUTH
+from geomoe3d.images.features import Keypoints, detect, match
 from geomoe3d.images.pose import residuals_of
 from geomoe3d.images.scenes import choose_pairs
-
-LEAST_SHARE, MOST_MEDIAN = 0.6, 1.0
-"""Of distinct matches below 2 pixels, and their median in pixels, of images reduced to 800."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def check_truth(scene: ImageScene, pairs: int = 40, seed: int = 0) -> TruthCheck
         matches = match(*(seen[view.path] for view in views))
         pixels = matches.pixels[matches.distinct()]
         rays = np.hstack([v.camera.normalise(pixels[:, 2 * k : 2 * k + 2]) for k, v in enumerate(views)])
-        scale = LONGER_SIDE / max(seen[views[0].path].size)
+        scale = KEYPOINTS.longer_side / max(seen[views[0].path].size)
         found.append(residuals_of(relative_pose(*views), rays) * views[0].camera.focal * scale)
     far = np.concatenate(found) if found else np.zeros(0)
     if len(far) == 0:
@@ -67,7 +65,7 @@ def check_truth(scene: ImageScene, pairs: int = 40, seed: int = 0) -> TruthCheck
             "nothing says whether its cameras are true"
         )
     share, median = float((far < 2.0).mean()), float(np.median(far))
-    usable = share >= LEAST_SHARE and median <= MOST_MEDIAN
+    usable = share >= TRUTH.least_share and median <= TRUTH.most_median
     return TruthCheck(
         scene.name, scene.layout, scene.notes, len(scene.views), len(chosen), len(far), share, median, usable
     )

@@ -22,7 +22,8 @@ from geomoe3d.evaluation.intervals import Quantity, measure_all
 from geomoe3d.evaluation.records import Measure
 from geomoe3d.geometry.essential import essential_of, label_threshold, pose_errors_deg, symmetric_distance
 from geomoe3d.images.cameras import Camera, ImageScene, View, opencv, relative_pose, rotation_deg
-from geomoe3d.images.features import LOOSE_RATIO, Keypoints, Matches, detect, match, read_grey
+from geomoe3d.images.config import KEYPOINTS
+from geomoe3d.images.features import Keypoints, Matches, detect, match, read_grey
 from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
@@ -31,8 +32,6 @@ from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray
 
 POSE_LIMITS, CORNER_LIMITS = (5.0, 10.0, 20.0), (3.0, 5.0, 10.0)
-ANGLES = ((3.0, 20.0), (20.0, 60.0))
-"""Half of a scene's pairs are turned by so many degrees, half by so many."""
 BASELINE = "all, RANSAC"
 
 
@@ -92,8 +91,10 @@ def area_under_recall(
 
 
 def pose_pairs(scene: ImageScene, count: int) -> list[tuple[View, View]]:
-    """``count`` pairs of a scene (fewer where there are none), half of them of either range of `ANGLES`."""
-    chosen = [pair for angles in ANGLES for pair in choose_pairs(scene, angles, count // 2)]
+    """``count`` pairs of a scene (fewer where there are none): half turned by 3 to 20 degrees, half by 20 to 60."""
+    chosen = [
+        pair for angles in ((3.0, 20.0), (20.0, 60.0)) for pair in choose_pairs(scene, angles, count // 2)
+    ]
     return [(scene.views[i], scene.views[j]) for i, j in chosen]
 
 
@@ -172,7 +173,7 @@ def _methods(
     scene: str, pair: str, found: Matches, true: BoolArray, rays: FloatArray, network: ImageNetwork | None,
     estimators: dict[str, str], error: Callable[[Any, str], tuple[float, str]], turned: float = math.nan,
 ) -> Iterator[Outcome]:  # fmt: skip
-    distinct, loose = found.distinct(), found.distinct(LOOSE_RATIO)
+    distinct, loose = found.distinct(), found.distinct(KEYPOINTS.loose_ratio)
     ways: list[tuple[str, str, Any, float]] = [(BASELINE, "RANSAC", np.ones(len(found), dtype=bool), 0.0)]
     ways += [(f"ratio test, {name}", name, distinct, 0.0) for name in list(estimators)[:2]]
     if network is not None:

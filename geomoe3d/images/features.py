@@ -14,19 +14,10 @@ from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError, MissingFileError
 from geomoe3d.images.cameras import opencv, simplejpeg
+from geomoe3d.images.config import KEYPOINTS
 from geomoe3d.types import BoolArray, Float32Array, FloatArray
 
 Detector = Literal["rootsift", "sift", "orb"]
-NUM_KEYPOINTS = 2000
-LONGER_SIDE = 800
-RATIO, LOOSE_RATIO = 0.8, 0.95
-"""Ratio test by itself, and behind a network that rejects wrong matches."""
-MOST_SEED = 2**31 - 1
-"""OpenCV holds its seed in 32 bits."""
-_MOST_PIXEL = 1e7
-"""Farther out no image reaches; squares of what is much larger no longer fit a number."""
-_CONTRAST = 1e-5
-"""So low that images without much contrast give as many keypoints as are asked for."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +52,7 @@ class Matches:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def distinct(self, ratio: float = RATIO) -> BoolArray:
+    def distinct(self, ratio: float = KEYPOINTS.ratio) -> BoolArray:
         """(N,) mutual ones that pass the ratio test."""
         return self.mutual & (self.ratio < ratio)
 
@@ -115,8 +106,8 @@ def _check_whole(path: Path) -> None:
 def detect(
     image: str | Path | NDArray[np.uint8],
     detector: Detector = "rootsift",
-    most: int = NUM_KEYPOINTS,
-    longer_side: int = LONGER_SIDE,
+    most: int = KEYPOINTS.number,
+    longer_side: int = KEYPOINTS.longer_side,
 ) -> Keypoints:
     """Keypoints of an image, reduced to ``longer_side`` pixels first where it is larger.
 
@@ -137,7 +128,11 @@ def detect(
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     if detector not in ("rootsift", "sift", "orb"):
         raise InputError(f"there is no detector '{detector}'; there are rootsift, sift and orb")
-    made = cv2.ORB_create(most) if detector == "orb" else cv2.SIFT_create(most, contrastThreshold=_CONTRAST)
+    made = (
+        cv2.ORB_create(most)
+        if detector == "orb"
+        else cv2.SIFT_create(most, contrastThreshold=KEYPOINTS.contrast)
+    )
     found, raw = made.detectAndCompute(grey, None)
     if raw is None:
         return Keypoints(np.zeros((0, 2)), np.zeros((0, 1), np.float32), (width, height))
@@ -181,12 +176,13 @@ def checked(pixels: object, weights: object, threshold: Any, seed: Any = 0) -> t
         raise InputError(f"matches must be (N, 4) and weights (N,), found {shape} and {w.shape}")
     usable = np.isfinite(points).all(axis=1)
     most = float(np.abs(points[usable]).max(initial=0.0))
-    if most > _MOST_PIXEL:
-        raise InputError(f"matches must be in pixels, found {most:g}; at most {_MOST_PIXEL:g} is allowed")
+    if most > 1e7:  # farther out no image reaches, and squares of much more no longer fit a number
+        raise InputError(f"matches must be in pixels, found {most:g}; at most 1e+07 is allowed")
     if threshold is not None and not (isinstance(threshold, Real) and 0 < float(threshold) < np.inf):
         raise InputError(f"the inlier threshold must be a positive number of pixels, found {threshold}")
-    if not (isinstance(seed, Integral) and 0 <= int(seed) <= MOST_SEED):
-        raise InputError(f"the seed must be a whole number from 0 to {MOST_SEED}, found {seed}")
+    largest = 2**31 - 1  # OpenCV holds its seed in 32 bits
+    if not (isinstance(seed, Integral) and 0 <= int(seed) <= largest):
+        raise InputError(f"the seed must be a whole number from 0 to {largest}, found {seed}")
     return points, np.where(usable, w, 0.0)
 
 

@@ -11,13 +11,9 @@ import torch
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.homography import MIN_MATCHES, weighted_dlt
 from geomoe3d.images.cameras import opencv
+from geomoe3d.images.config import HOMOGRAPHY
 from geomoe3d.images.features import checked
 from geomoe3d.types import BoolArray, FloatArray
-
-THRESHOLD = 3.0
-"""Default inlier threshold, pixels."""
-
-_LEAST_INLIERS, _MOST_BETWEEN_HALVES = 15, 3.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ def find_homography(
     *,
     weights: FloatArray | None = None,
     estimator: Literal["magsac", "ransac", "dlt"] = "magsac",
-    threshold: float = THRESHOLD,
+    threshold: float = HOMOGRAPHY.threshold,
     seed: int = 0,
 ) -> HomographyResult:
     """The homography that matches (N, 4) = [u0, v0, u1, v1] agree on; arguments as of `geomoe3d.images.pose`.
@@ -78,8 +74,10 @@ def find_homography(
     residuals = np.nan_to_num(residuals, nan=np.inf)
     inliers = (residuals < threshold) & (w > 0)
     reasons = []
-    if inliers.sum() < _LEAST_INLIERS:
-        reasons.append(f"{inliers.sum()} inliers; below {_LEAST_INLIERS} a wrong homography finds as many")
+    if inliers.sum() < HOMOGRAPHY.least_inliers:
+        reasons.append(
+            f"{inliers.sum()} inliers; below {HOMOGRAPHY.least_inliers} a wrong homography finds as many"
+        )
     elif (
         np.linalg.matrix_rank(pixels[inliers, :2] - pixels[inliers, :2].mean(axis=0), tol=10 * threshold) < 2
     ):
@@ -96,7 +94,7 @@ def find_homography(
                 off,
                 float(np.nan_to_num(np.abs(map_points(other.numpy(), extent) - corners), nan=np.inf).max()),
             )
-        if off > _MOST_BETWEEN_HALVES * threshold:
+        if off > HOMOGRAPHY.most_between_halves * threshold:
             reasons.append(f"half of the inliers alone move a corner of what is matched by {off:.0f} pixels")
     return HomographyResult("low_confidence" if reasons else "ok", tuple(reasons), H, inliers, residuals)
 

@@ -14,7 +14,6 @@ from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
-_MOST = 400
 
 
 def save_matches(
@@ -70,7 +69,7 @@ def save_matches(
         (np.flatnonzero(~kept), "#d1495b", 0.3),
         (np.flatnonzero(kept), "#2e9e5b", 0.6),
     ):
-        some = rng.permutation(rows)[:_MOST]
+        some = rng.permutation(rows)[:400]
         lines = pixels[some].reshape(-1, 2, 2) + np.array([[0, 0], [images[0].shape[1], 0]])
         axes.add_collection(LineCollection(list(lines), colors=color, linewidths=width, alpha=0.7))
     axes.set_axis_off()

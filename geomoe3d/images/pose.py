@@ -27,18 +27,11 @@ from geomoe3d.geometry.essential import (
     weighted_eight_point,
 )
 from geomoe3d.images.cameras import Camera, opencv, rotation_deg
+from geomoe3d.images.config import POSE
 from geomoe3d.images.features import checked
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 Estimator = Literal["magsac", "ransac", "eight_point"]
-PIXEL_SHARE = 1.0 / 800
-"""Default inlier threshold, a share of the image's longer side: one pixel of the image as keypoints are sought."""
-
-_MOST_SAMPLES, _CONFIDENCE = 2_000, 0.99999
-_LEAST_INLIERS, _MOST_BETWEEN_HALVES_DEG = 30, 10.0
-_OVER_CHANCE = 3.0
-_EXPLAINED, _OTHER_POSE_DEG = 0.9, 3.0
-_LEAST_PARALLAX = 3.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +96,7 @@ def find_pose(
     focal = (cameras[0].focal + cameras[1].focal) / 2
     if threshold is None:
         sides = [camera.side(pixels[usable, 2 * k : 2 * k + 2]) for k, camera in enumerate(cameras)]
-        threshold = PIXEL_SHARE * focal * max(sides)
+        threshold = POSE.pixel_share * focal * max(sides)
     rays = np.full_like(pixels, np.nan)
     for k, camera in enumerate(cameras):
         rays[usable, 2 * k : 2 * k + 2] = camera.normalise(pixels[usable, 2 * k : 2 * k + 2])
@@ -160,9 +153,9 @@ def _estimate(
             second,
             np.eye(3),
             method=method,
-            prob=_CONFIDENCE,
+            prob=POSE.sureness,
             threshold=threshold,
-            maxIters=_MOST_SAMPLES,
+            maxIters=POSE.most_samples,
         )
     except cv2.error:  # raised where no sample gives a matrix
         return None
@@ -184,17 +177,17 @@ def _judged(
     found = int(inliers.sum())
     reasons, ambiguous, parallax = [], False, 0.0
     alternatives: tuple[FloatArray, ...] = ()
-    if found < _LEAST_INLIERS:
-        reasons.append(f"{found} inliers; below {_LEAST_INLIERS} a wrong pose finds as many")
+    if found < POSE.least_inliers:
+        reasons.append(f"{found} inliers; below {POSE.least_inliers} a wrong pose finds as many")
     if found >= MIN_MATCHES:
         chance = _by_chance(T, rays[kept], threshold) * kept.sum()
-        if found < _OVER_CHANCE * chance + _LEAST_INLIERS:
+        if found < POSE.over_chance * chance + POSE.least_inliers:
             reasons.append(
                 f"{found} inliers, where matches shuffled at random have {chance:.0f} under this pose"
             )
         x = rays[inliers]
         parallax = float(np.median(np.linalg.norm(_turned(x) - x[:, 2:], axis=1)))
-        if parallax < _LEAST_PARALLAX * threshold:
+        if parallax < POSE.least_parallax * threshold:
             ambiguous = True
             reasons.append(
                 f"the inliers move by {parallax * focal:.1f} pixels beyond a rotation: the camera only turned, or its "
@@ -205,10 +198,10 @@ def _judged(
             if alternatives:
                 ambiguous = True
                 reasons.append("nearly all inliers lie in one plane, and a second pose explains them as well")
-            elif (off := _between_halves(T, np.flatnonzero(kept), again)) > _MOST_BETWEEN_HALVES_DEG:
+            elif (off := _between_halves(T, np.flatnonzero(kept), again)) > POSE.most_between_halves_deg:
                 reasons.append(
                     f"half of the matches alone give a pose that is off by {off:.0f} degrees; "
-                    f"{_MOST_BETWEEN_HALVES_DEG:.0f} are allowed"
+                    f"{POSE.most_between_halves_deg:.0f} are allowed"
                 )
     status: Literal["ok", "low_confidence", "ambiguous"] = "ok"
     if reasons:
@@ -264,7 +257,7 @@ def _of_a_plane(T: FloatArray, x: FloatArray, threshold: float) -> tuple[FloatAr
     for R, t in zip(turns, steps, strict=True):
         other = np.vstack([np.hstack([R, t / max(np.linalg.norm(t), 1e-12)]), [0, 0, 0, 1]])
         fits = (residuals_of(other, x) < threshold) & before_both(other, x)
-        if rotation_deg(other @ np.linalg.inv(T)) > _OTHER_POSE_DEG and fits.mean() > _EXPLAINED:
+        if rotation_deg(other @ np.linalg.inv(T)) > POSE.other_pose_deg and fits.mean() > POSE.explained:
             others.append(other)
     return tuple(others)
 

@@ -16,8 +16,6 @@ from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
-_UNKNOWN = 0.6  # grey of points without a colour, where others have one
-
 
 def merge_clouds(
     paths: Sequence[str], numbers: Sequence[int], poses: Sequence[FloatArray], voxel_size: float
@@ -48,7 +46,8 @@ def merge_clouds(
     known: BoolArray = np.isfinite(colors).all(axis=1)  # type: ignore[assignment]
     return RawCloud(
         merged[:, :3] + origin,
-        colors=np.where(known[:, None], colors, _UNKNOWN) if known.any() else None,
+        # Grey for points without a colour, where others have one.
+        colors=np.where(known[:, None], colors, 0.6) if known.any() else None,
         fields={"scan": merged[:, 7].astype(np.int32), "num_scans": num_scans.astype(np.int32)},
     )
 

@@ -23,9 +23,7 @@ from geomoe3d.visual.drawing import thin
 from geomoe3d.visual.templates import base64_floats, render_cloud_page
 from geomoe3d.visual.upright import upright_axes
 
-MAX_POINTS = 300_000
 _KEPT, _REJECTED = "#0b9b6b", "#c02626"
-_GOLDEN = 0.61803398875  # steps of the hue: neighbours in the list differ most
 
 
 def save_model_page(model: SceneModel, path: Path) -> None:
@@ -78,7 +76,7 @@ def _clouds(model: SceneModel, colors: dict[str, str]) -> tuple[list[dict[str, A
     """Thinned clouds in page coordinates, groups shifted beside each other, and the middle of each scan."""
     paths = {scan.name: scan.path for scan in model.scans}
     placed = sum(len(group.poses) for group in model.groups)
-    share = max(500, MAX_POINTS // max(placed, 1))
+    share = max(500, 300_000 // max(placed, 1))
     rng = np.random.default_rng(0)
     clouds: list[dict[str, Any]] = []
     centers: dict[str, FloatArray] = {}
@@ -133,5 +131,6 @@ def _summary(model: SceneModel, placed: int) -> str:
 
 
 def _color(number: int) -> str:
-    r, g, b = colorsys.hls_to_rgb((0.58 + _GOLDEN * number) % 1.0, 0.5 + 0.1 * (number % 3 - 1), 0.7)
+    # Steps by the golden ratio: neighbours in the list differ most.
+    r, g, b = colorsys.hls_to_rgb((0.58 + 0.61803398875 * number) % 1.0, 0.5 + 0.1 * (number % 3 - 1), 0.7)
     return f"#{round(255 * r):02x}{round(255 * g):02x}{round(255 * b):02x}"

@@ -17,8 +17,6 @@ from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
 
-_LARGEST_TRANSFORM = 4096  # bytes
-
 
 @dataclass(frozen=True)
 class Scan:
@@ -97,7 +95,8 @@ def find_clouds(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
 
 
 def _is_transform(path: Path) -> bool:
-    if path.stat().st_size > _LARGEST_TRANSFORM:
+    # A transform is some hundred bytes.
+    if path.stat().st_size > 4096:
         return False
     try:
         load_transform(path)

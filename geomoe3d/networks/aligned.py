@@ -49,9 +49,6 @@ CHANNELS = (
 NUM_CHANNELS = len(CHANNELS)
 PRIOR_KERNEL = math.exp(-0.5 / 0.75**2)
 """The channel ``residual`` at a residual of one inlier threshold: the network's first prior is what lies below."""
-_MOST_ANCHORS = 1000
-_ROWS_AT_ONCE = 125
-_REACH = 3.0  # inlier thresholds in which a surface point of the other scan is sought
 
 
 class AlignedChannels:
@@ -131,11 +128,13 @@ class AlignedChannels:
 def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
     """Parts of (N,): 5 x the share of at most 1,000 correspondences with which each one preserves length."""
     unit = (rows - rows.mean(0)).astype(np.float32)
-    chosen = drawn_rows(rows, 1.0, _MOST_ANCHORS)
+    chosen = drawn_rows(rows, 1.0, 1000)
     anchors, is_anchor = unit[chosen], np.isin(np.arange(len(unit)), chosen)
 
+    at_once = 125  # rows
+
     def part(start: int) -> Float32Array:
-        some = unit[start : start + _ROWS_AT_ONCE]
+        some = unit[start : start + at_once]
         itself = is_anchor[start : start + len(some)]  # only an anchor meets itself
         gap = distances(some[:, :3], anchors[:, :3])
         gap -= distances(some[:, 3:], anchors[:, 3:])
@@ -143,7 +142,7 @@ def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
         share: Float32Array = (5 * (compatible.sum(1) - itself) / len(anchors)).astype(np.float32)
         return share
 
-    return [partial(part, start) for start in range(0, len(unit), _ROWS_AT_ONCE)]
+    return [partial(part, start) for start in range(0, len(unit), at_once)]
 
 
 def _kernel(square: FloatArray) -> FloatArray:
@@ -154,7 +153,8 @@ def _kernel(square: FloatArray) -> FloatArray:
 
 def _ask(points: FloatArray, normals: FloatArray, surface: Surface, signed: bool) -> dict[str, FloatArray]:
     """What a surface says of points (n, 3) with normals that are claimed to exist in its frame."""
-    distance, nearest = surface.tree.query(points, distance_upper_bound=_REACH)  # type: ignore[attr-defined]
+    # A surface point of the other scan is sought within so many inlier thresholds.
+    distance, nearest = surface.tree.query(points, distance_upper_bound=3.0)  # type: ignore[attr-defined]
     hit = np.flatnonzero(np.isfinite(distance))
     index: IntArray = nearest[hit]
     near, plane, cosine = np.zeros((3, len(points)))

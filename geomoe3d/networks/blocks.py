@@ -15,7 +15,6 @@ from geomoe3d.networks.norms import BatchNorm, ContextNorm, Pointwise, norm_relu
 
 # Score of a key that the prior rejects: far below any real one, yet finite, so that a row in which every
 # key is rejected becomes uniform attention instead of NaN.
-REJECTED_SCORE = -1e6
 
 
 class PointCN(nn.Module):
@@ -102,7 +101,7 @@ class GraphAttention(nn.Module):
             k = k * scale
         scores = q.transpose(2, 3) @ k
         if b_kept is not None:
-            scores = scores.masked_fill(~b_kept[:, None], REJECTED_SCORE)
+            scores = scores.masked_fill(~b_kept[:, None], -1e6)  # no weight after the softmax
         if b_mask is not None:
             scores = scores.masked_fill(~b_mask[:, None], -torch.inf)
         attention = scores.softmax(dim=-1)

@@ -19,7 +19,6 @@ from torch import Tensor
 from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.networks.architecture import NetworkConfig
 
-_POWER_ITERATIONS = 10
 _CHUNK_ROWS = 4096
 
 
@@ -150,7 +149,7 @@ class _Table:
         """(A,) leading eigenvector of S among the anchors, by power iteration."""
         block = self.second if self.square else self.second[self.anchors]
         v = torch.ones(len(self.anchors), device=block.device, dtype=block.dtype)
-        for _ in range(_POWER_ITERATIONS):
+        for _ in range(10):  # power iterations
             v = block @ v
             v = v / v.max().clamp(min=1e-12)
         return v

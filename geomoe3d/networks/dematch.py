@@ -14,8 +14,6 @@ from geomoe3d.networks.base import CorrespondenceNetwork
 from geomoe3d.networks.blocks import GraphAttention
 from geomoe3d.networks.norms import BatchNorm, ContextNorm, Pointwise, norm_relu_linear
 
-_CLUSTER, _REFINE = 2, 4  # attention blocks of each kind in a layer
-
 
 class DeMatch(CorrespondenceNetwork):
     """``num_layers`` layers of seven attention blocks each; 5,859,013 parameters (4D: 5,858,949)."""
@@ -64,8 +62,8 @@ class DecompositionLayer(nn.Module):
 
     def __init__(self, width: int, num_heads: int) -> None:
         super().__init__()
-        self.cluster = nn.ModuleList(GraphAttention(width, num_heads) for _ in range(_CLUSTER))
-        self.refine = nn.ModuleList(GraphAttention(width, num_heads) for _ in range(_REFINE))
+        self.cluster = nn.ModuleList(GraphAttention(width, num_heads) for _ in range(2))
+        self.refine = nn.ModuleList(GraphAttention(width, num_heads) for _ in range(4))
         self.rebuild = GraphAttention(width, num_heads)
         self.predict = ChangePredictor(width)
 

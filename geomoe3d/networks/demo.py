@@ -15,9 +15,6 @@ from geomoe3d.networks.blocks import GraphAttention, PointCN, SubFieldPool
 from geomoe3d.networks.layers import InlierPredictor, LocalOrthogonalContext, MotionInitialisation
 from geomoe3d.networks.norms import Pointwise
 
-_BETA, _LAMBDA = 0.1, 8.0
-_LEAST_WEIGHT, _LARGEST_WEIGHT = 0.05, 0.95
-
 
 class DeMo(CorrespondenceNetwork):
     """``num_layers`` double layers with ``num_sub_fields`` samples; 4,519,908 parameters (4D: 4,519,588)."""
@@ -86,8 +83,8 @@ class KernelRegression(nn.Module):
         self.trust = InlierPredictor(width)
         self.place = Pointwise(place_width, place_width)
         self.value = Pointwise(width, width)
-        self.beta = nn.Parameter(torch.tensor(_BETA))
-        self.ridge = nn.Parameter(torch.tensor(_LAMBDA))
+        self.beta = nn.Parameter(torch.tensor(0.1))
+        self.ridge = nn.Parameter(torch.tensor(8.0))
         self.rectify = GraphAttention(width, num_heads)
         self.spread = GraphAttention(width, num_heads)
 
@@ -96,7 +93,7 @@ class KernelRegression(nn.Module):
         samples, shares = self.pool(field, mask)
         x = self.place(places @ shares.transpose(1, 2)).transpose(1, 2).float()
         samples, _ = self.gather(samples, field, b_mask=mask)
-        weights = self.trust(samples, None).sigmoid().clamp(_LEAST_WEIGHT, _LARGEST_WEIGHT)
+        weights = self.trust(samples, None).sigmoid().clamp(0.05, 0.95)
         values = self.value(samples).transpose(1, 2).float()
         apart = (x[:, :, None] - x[:, None]).square().sum(-1)
         K = torch.exp(-self.beta.clamp(min=1e-4) * apart)

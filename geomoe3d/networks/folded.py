@@ -34,8 +34,6 @@ from geomoe3d.types import Float32Array, FloatArray, IntArray
 if TYPE_CHECKING:
     from geomoe3d.networks.geomoe import GeoMoE
 
-_REJECTED = np.float32(-1e9)
-
 
 class FoldedOutput(NamedTuple):
     """Logits of every layer and what the last layer did.
@@ -224,7 +222,8 @@ class _Gather:
         scores = np.matmul(into, field)
         if logits is not None and self.prior == "mask":
             # Finite, so that attention is uniform where all are rejected.
-            np.copyto(scores, _REJECTED, where=(logits <= 0)[:, None])
+            # no weight after the softmax
+            np.copyto(scores, np.float32(-1e9), where=(logits <= 0)[:, None])
         gathered = np.matmul(softmax(scores, 2), field.swapaxes(1, 2))
         gathered = gathered.reshape(num, self.heads, num_fields, -1)
         return self.update(z, np.matmul(self.value, gathered.swapaxes(2, 3)).reshape(z.shape))

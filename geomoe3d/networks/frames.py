@@ -12,8 +12,6 @@ from torch import Tensor
 from geomoe3d.networks.architecture import Frame
 from geomoe3d.networks.seeded_motions import length_affinity, seeded_motion
 
-_MOST_ROWS = 2000  # compared with all others when a hypothesis is sought
-_SEEDS = 0.1
 THRESHOLD_VOXELS = 2.0
 
 
@@ -52,8 +50,9 @@ def principal_axes(points: Tensor) -> Tensor:
 def _hypothesis(points: Tensor, threshold: float) -> Tensor:
     """Rotation (3, 3) of the motion with most inliers, source to target."""
     # Evenly over the rows: which ones does not matter, and nothing is drawn at random.
-    rows = points[torch.linspace(0, len(points) - 1, min(len(points), _MOST_ROWS)).long()]
+    # So many are compared with all others.
+    rows = points[torch.linspace(0, len(points) - 1, min(len(points), 2000)).long()]
     affinity = length_affinity(rows, threshold)
-    seeds = affinity.sum(1).topk(max(1, int(len(rows) * _SEEDS))).indices
+    seeds = affinity.sum(1).topk(max(1, int(len(rows) * 0.1))).indices  # a tenth
     R: Tensor = seeded_motion(rows, affinity, seeds, threshold)[:3, :3]
     return R

@@ -20,8 +20,6 @@ from geomoe3d.networks.weight_files import WeightCard, read_weights
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, IntArray
 
-_PARTS = 2  # of a lot, side by side; for any number of threads: last bits depend on how many share a batch
-
 
 class Judged:
     """What the network says under one motion.
@@ -114,7 +112,8 @@ class PairJudge:
         """
         if self._inputs is None or len(motions) == 0:
             return []
-        parts = np.array_split(motions, min(_PARTS, len(motions)))
+        # Side by side; two for any number of threads, since last bits depend on how many share a batch.
+        parts = np.array_split(motions, min(2, len(motions)))
         return [judged for part in each(self._judge, parts) for judged in part]
 
     def _judge(self, motions: FloatArray) -> list[Judged]:

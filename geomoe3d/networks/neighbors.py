@@ -16,8 +16,6 @@ from geomoe3d.types import IntArray
 if TYPE_CHECKING:
     from torch import Tensor
 
-_CHUNK_ENTRIES = 1 << 24
-
 
 def nearest_rows(values: NDArray[Any], num_neighbors: int, *, threads: int = 1) -> IntArray:
     """The nearest rows of each row, Euclidean.
@@ -45,7 +43,7 @@ def nearest_neighbors(values: Tensor, num_neighbors: int) -> Tensor:
     if values.device.type == "cpu":
         threads = torch.get_num_threads()
         return torch.from_numpy(nearest_rows(values.detach().numpy(), num_neighbors, threads=threads))
-    rows = max(1, _CHUNK_ENTRIES // len(values))
+    rows = max(1, 2**24 // len(values))  # entries of the matrix at a time
     parts = [
         torch.cdist(part, values, compute_mode="donot_use_mm_for_euclid_dist")
         .topk(min(num_neighbors, len(values)), dim=1, largest=False)

@@ -17,16 +17,14 @@ from geomoe3d.networks.blocks import PointCN, SubFieldPool
 from geomoe3d.networks.layers import motion, weights_from_logits
 from geomoe3d.networks.norms import BatchNorm, ContextNorm, Pointwise, norm_relu_linear
 
-_BLOCKS = 3  # of each kind in a stage
-_CARRIED = 2  # channels that the first stage hands on: residual and weight
-
 
 class OANet(CorrespondenceNetwork):
     """``num_layers`` stages with ``num_sub_fields`` clusters; 2,473,050 parameters (4D: 2,472,538)."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
-        later = [config.input_width + _CARRIED] * (config.num_layers - 1)
+        # The first stage hands on two channels: residual and weight.
+        later = [config.input_width + 2] * (config.num_layers - 1)
         self.stages = nn.ModuleList(
             Stage(num_in, config.width, config.num_sub_fields) for num_in in (config.input_width, *later)
         )
@@ -54,12 +52,13 @@ class Stage(nn.Module):
     def __init__(self, num_in: int, width: int, num_clusters: int) -> None:
         super().__init__()
         self.embedding = Pointwise(num_in, width)
-        self.before = nn.ModuleList(PointCN(width) for _ in range(_BLOCKS))
+        blocks = 3  # of each kind in a stage
+        self.before = nn.ModuleList(PointCN(width) for _ in range(blocks))
         self.pool = SubFieldPool(width, num_clusters)
-        self.filters = nn.ModuleList(OrderAwareFilter(width, num_clusters) for _ in range(_BLOCKS))
+        self.filters = nn.ModuleList(OrderAwareFilter(width, num_clusters) for _ in range(blocks))
         self.unpool = SubFieldUnpool(width, num_clusters)
         self.merge = NarrowingPointCN(2 * width, width)
-        self.after = nn.ModuleList(PointCN(width) for _ in range(_BLOCKS - 1))
+        self.after = nn.ModuleList(PointCN(width) for _ in range(blocks - 1))
         self.predict = Pointwise(width, 1)
 
     def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:

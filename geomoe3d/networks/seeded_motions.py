@@ -14,12 +14,6 @@ from torch import Tensor
 
 from geomoe3d.geometry.kabsch import weighted_kabsch
 
-SET_SIZE = 40
-SEED_SHARE = 0.1
-_POWER_ITERATIONS = 10
-_REFITS = 20
-_AT_ONCE = 4_000_000  # residuals held at a time
-
 
 def spread_seeds(scores: Tensor, points: Tensor, radius: float) -> Tensor:
     """Rows (S,) that score best within ``radius`` of their source points, a tenth of all rows at most.
@@ -32,7 +26,7 @@ def spread_seeds(scores: Tensor, points: Tensor, radius: float) -> Tensor:
     near = torch.cdist(points, points) < radius
     best_near = scores.expand(len(scores), -1).masked_fill(~near, -torch.inf).amax(1)
     peaks = (scores >= best_near).nonzero()[:, 0]
-    count = max(1, int(len(scores) * SEED_SHARE))
+    count = max(1, int(len(scores) * 0.1))  # a tenth are seeds, as published
     return peaks[scores[peaks].argsort(descending=True, stable=True)[:count]]
 
 
@@ -49,19 +43,20 @@ def seeded_motion(points: Tensor, affinity: Tensor, seeds: Tensor, threshold: fl
         (4, 4) p_target = R p_source + t; some rotation where the rows fix none.
     """
     source, target = points[:, :3], points[:, 3:]
-    sets = affinity[seeds].topk(min(SET_SIZE, len(points)), dim=1).indices
+    sets = affinity[seeds].topk(min(40, len(points)), dim=1).indices
     local = affinity[sets[:, :, None], sets[:, None, :]].double()
     vector = torch.ones_like(local[:, :, :1])
-    for _ in range(_POWER_ITERATIONS):
+    for _ in range(10):  # power iterations
         vector = torch.nn.functional.normalize(local @ vector, dim=1)
     motions = weighted_kabsch(source[sets], target[sets], vector[:, :, 0]).T_target_source
-    size = max(1, _AT_ONCE // len(points))
+    # So many residuals are held at a time.
+    size = max(1, 4_000_000 // len(points))
     counts = [
         (motion_residuals(some, source, target) < threshold).sum(1) for some in torch.split(motions, size)
     ]
     T = motions[int(torch.cat(counts).argmax())]
     last = -1
-    for _ in range(_REFITS):
+    for _ in range(20):  # refits, as published
         residual = motion_residuals(T[None], source, target)[0]
         inside = residual < threshold
         if int(inside.sum()) in (last, 0, 1, 2):

@@ -15,10 +15,6 @@ from geomoe3d.networks.blocks import GraphAttention, PointCN, TwoLayer
 from geomoe3d.networks.layers import InlierPredictor, motion, weights_from_logits
 from geomoe3d.networks.norms import ContextNorm, Pointwise
 
-_RATIOS = (0.125, 0.5, 0.5)
-_FEWEST = 2  # rows of a level: one alone has no statistics
-_CONTEXT_AFTER = (1, 3)  # layers, counted from 0, that a global context follows
-
 
 class UMatch(CorrespondenceNetwork):
     """``num_layers`` U-shaped layers, global context after the second and fourth; 7,764,824 parameters."""
@@ -30,7 +26,8 @@ class UMatch(CorrespondenceNetwork):
             UShapedLayer(config.width, config.num_heads) for _ in range(config.num_layers)
         )
         self.context = nn.ModuleDict(
-            {str(k): GlobalContext(config.width) for k in _CONTEXT_AFTER if k < config.num_layers}
+            # Layers, counted from 0, that a global context follows.
+            {str(k): GlobalContext(config.width) for k in (1, 3) if k < config.num_layers}
         )
 
     def verdicts(
@@ -52,9 +49,10 @@ class UShapedLayer(nn.Module):
 
     def __init__(self, width: int, num_heads: int) -> None:
         super().__init__()
-        self.down = nn.ModuleList(Thinning(width, num_heads, ratio) for ratio in _RATIOS)
+        ratios = (0.125, 0.5, 0.5)
+        self.down = nn.ModuleList(Thinning(width, num_heads, ratio) for ratio in ratios)
         self.bottom = GraphAttention(width, num_heads)
-        self.up = nn.ModuleList(GraphAttention(width, num_heads) for _ in _RATIOS)
+        self.up = nn.ModuleList(GraphAttention(width, num_heads) for _ in ratios)
         self.mix = Pointwise(width, width)
         self.context_norm = ContextNorm()
         self.predict = InlierPredictor(width)
@@ -87,11 +85,11 @@ class Thinning(nn.Module):
     def forward(self, x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """(B, C, N) to (B, C, k), k a share of the real rows and at least 2, and its mask."""
         score = self.score(x)[:, 0].sigmoid()
-        kept = None
+        kept, fewest = None, 2  # rows: one alone has no statistics
         if mask is None:
-            count = min(x.shape[2], max(_FEWEST, int(x.shape[2] * self.ratio)))
+            count = min(x.shape[2], max(fewest, int(x.shape[2] * self.ratio)))
         else:
-            each = (mask.sum((1, 2)) * self.ratio).long().clamp(min=_FEWEST)
+            each = (mask.sum((1, 2)) * self.ratio).long().clamp(min=fewest)
             count = int(each.max())
             kept = (torch.arange(count, device=x.device)[None] < each[:, None])[:, None]
         order = score if mask is None else score.masked_fill(~mask[:, 0], -1.0)

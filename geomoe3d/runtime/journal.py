@@ -17,8 +17,6 @@ from typing import IO, Any
 
 from geomoe3d.errors import FormatError, OutputError, cannot_read
 
-_SYNC_SECONDS = 1.0
-
 
 def read_journal(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
     """The complete records of a journal, in order of writing; a torn last line is left out.
@@ -85,7 +83,7 @@ class Journal:
         try:
             self._stream.write(line)
             self._stream.flush()
-            if time.monotonic() - self._synced > _SYNC_SECONDS:
+            if time.monotonic() - self._synced > 1.0:  # s
                 self._sync()
         except OSError as error:
             raise OutputError(f"cannot write '{self.path}': {error.strerror}") from None

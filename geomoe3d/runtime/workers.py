@@ -34,7 +34,6 @@ from geomoe3d.runtime.threads import THREADS_VARIABLE
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_MOST_DEATHS = 1
 _DIED = "the worker died over it several times, perhaps for lack of memory or by a fault of native code"
 THREAD_VARIABLES = (THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -262,7 +261,7 @@ def run_surviving(
                 if error is None:
                     yield item, future.result()
                 elif isinstance(error, BrokenExecutor):
-                    if deaths > _MOST_DEATHS:
+                    if deaths > 1:  # one may be chance
                         yield item, WorkerDied(_DIED)
                     else:
                         suspects.append((item, deaths + 1))

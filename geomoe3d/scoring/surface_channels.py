@@ -38,8 +38,7 @@ RAW = (
 """
 NUM_RAW = len(RAW)
 NUM_CHANNELS = 19
-_REACH, _DEEPEST, _NUM_RANDOM, _NEIGHBORS = 3.0, 20.0, 256, 12
-_FPFH_SHARE = 0.3  # of the features that the network was trained with
+_REACH = 3.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class SurfaceChannels:
             cloud, other = clouds[k], clouds[1 - k]
             assert cloud.features is not None and other.features is not None
             points, features = cloud.points[rows[k]], cloud.features[rows[k]]
-            random = drawn_rows(other.points, pair.voxel_size, _NUM_RANDOM, 4)
+            random = drawn_rows(other.points, pair.voxel_size, 256, 4)
             similarity = features @ other.features.T
             away = np.zeros(NUM_POINTS)
             view = None
@@ -119,7 +118,8 @@ class SurfaceChannels:
         x = np.broadcast_to(np.arange(NUM_POINTS), shape)
         similar = side.similarity[x, y]
         assert other.features is not None
-        fpfh = np.einsum("kni,kni->kn", side.features[x, LEARNED:], other.features[y, LEARNED:]) / _FPFH_SHARE
+        # Of the features that the network was trained with 0.3 were FPFH.
+        fpfh = np.einsum("kni,kni->kn", side.features[x, LEARNED:], other.features[y, LEARNED:]) / 0.3
         more_similar = (side.of_random[None] > similar[:, :, None]).sum(2)
         seen: FloatArray = np.zeros(shape)
         margin: FloatArray = np.zeros(shape)
@@ -127,7 +127,7 @@ class SurfaceChannels:
             behind = side.view.margins(moved.reshape(-1, 3))[0].reshape(shape)
             saw = np.isfinite(behind)
             seen = saw.astype(np.float64)
-            margin = np.clip(np.where(saw, behind, 0.0) / self._threshold, -_DEEPEST, _DEEPEST)
+            margin = np.clip(np.where(saw, behind, 0.0) / self._threshold, -20.0, 20.0)
         best = side.similarity.max(1)
         columns = (
             hit,
@@ -171,7 +171,7 @@ def _kernel(x: Float32Array) -> Float32Array:
 
 def _planarity(cloud: PreparedCloud) -> FloatArray:
     """(n,) mean magnitude of the cosines between a point's normal and those around it."""
-    _, around = cloud.tree.query(cloud.points, k=min(_NEIGHBORS, len(cloud)))
+    _, around = cloud.tree.query(cloud.points, k=min(12, len(cloud)))
     around = np.asarray(around).reshape(len(cloud), -1)
     found: FloatArray = np.abs(np.einsum("nki,ni->nk", cloud.normals[around], cloud.normals)).mean(1)
     return found

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 SURFACE_NETWORK = "surface_network"
 WEIGHTS = Path(__file__).parent / "weights" / "surface_network.safetensors"
-_NEAR = 1  # the channel that says how near a point has come
-_FLOOR = 0.02  # of all points: fewer near ones are no sample
 
 
 @dataclass(frozen=True)
@@ -90,10 +88,12 @@ class SurfaceNetworkScorer(Scorer):
 
 def logits(tensors: dict[str, Float32Array], channels: Float32Array) -> Float32Array:
     """(K,) logits for channels (K, 2, N, `NUM_CHANNELS`); the same whichever cloud comes first."""
-    near = channels[..., _NEAR, None]
+    # The channel that says how near a point has come.
+    near = channels[..., 1, None]
     x = (channels - tensors["mean"]) / tensors["std"]
     held = np.maximum(_linear(tensors, "point.2", np.maximum(_linear(tensors, "point.0", x), 0)), 0)
-    floor = _FLOOR * x.shape[2]
+    # Fewer near ones than 2 % of all points are no sample.
+    floor = 0.02 * x.shape[2]
     pooled = np.concatenate(
         [held.mean(2), (held * near).sum(2) / (near.sum(2) + floor), held.max(2), x.mean(2)], axis=-1
     ).mean(1)

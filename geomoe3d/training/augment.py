@@ -41,11 +41,6 @@ class AugmentationConfig(Section):
     )
 
 
-_BEND_WAVES = 3
-_BEND_VOXELS = (30.0, 150.0)
-"""Wavelengths of a bend: 1.5 to 7.5 m at 5 cm, from a piece of furniture to more than a fragment."""
-
-
 def augment(
     pair: TrainingPair, config: AugmentationConfig, max_rows: int | None, rng: np.random.Generator
 ) -> TrainingPair:
@@ -85,10 +80,12 @@ def _turn(largest_deg: float, rng: np.random.Generator) -> FloatArray:
 
 def _bent(points: FloatArray, most: float, voxel_size: float, rng: np.random.Generator) -> FloatArray:
     """Points (N, 3) moved by a sum of long waves; equal points stay equal."""
-    amplitude = rng.uniform(0, most) * voxel_size / np.sqrt(_BEND_WAVES)
+    waves = 3
+    amplitude = rng.uniform(0, most) * voxel_size / np.sqrt(waves)
     moved: FloatArray = points.copy()
-    for _ in range(_BEND_WAVES):
-        low, high = np.log(_BEND_VOXELS)
+    for _ in range(waves):
+        # Wavelengths of 1.5 to 7.5 m at 5 cm: from a piece of furniture to more than a fragment.
+        low, high = np.log((30.0, 150.0))
         length = np.exp(rng.uniform(low, high)) * voxel_size
         along, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         phase = points @ along * (2 * np.pi / length) + rng.uniform(0, 2 * np.pi)

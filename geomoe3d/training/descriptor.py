@@ -29,10 +29,6 @@ from geomoe3d.training.descriptor_network import WIDTH, DescriptorNetwork
 from geomoe3d.training.descriptor_pairs import ContrastBatch, ContrastPairs
 from geomoe3d.training.distributed import Process, choose_device
 
-_RIGHT = 2.0  # voxels: a match so near is right, as in registration
-_WRONG = 3.0  # voxels: one farther off is wrong; those between count as neither
-_NEVER = -1e4
-_AVERAGE_DECAY = 0.995
 _FREE_KEYS = {"device", "save_every"}  # may differ when a run goes on
 
 
@@ -55,7 +51,9 @@ class DescriptorTrainConfig(Section):
     save_every: int = Field(250, ge=1, description="steps")
 
 
-def contrast(features: Tensor, apart: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+def contrast(
+    features: Tensor, apart: Tensor, scale: Tensor, *, right_to: float = 2.0, wrong_from: float = 3.0
+) -> tuple[Tensor, Tensor]:
     """How far the shared points are from finding each other among all points asked, and how many do.
 
     -log of the softmax weight of all that is right, against all that is wrong, mean over all of them.
@@ -64,6 +62,8 @@ def contrast(features: Tensor, apart: Tensor, scale: Tensor) -> tuple[Tensor, Te
         features: (2 P, q, D) of P pairs, source and target in turn, unit length.
         apart: (2 P, m, q), see `ContrastBatch`.
         scale: similarity counts so many times.
+        right_to: voxels; a match so near is right, as in registration.
+        wrong_from: voxels; one farther off is wrong; those between count as neither.
 
     Returns:
         The loss, and the share of shared points whose most similar point is right.
@@ -73,10 +73,11 @@ def contrast(features: Tensor, apart: Tensor, scale: Tensor) -> tuple[Tensor, Te
     pairs, q, width = features.shape
     other = features.view(pairs // 2, 2, q, width).flip(1).flatten(0, 1)
     logit = scale * features[:, : apart.shape[1]] @ other.transpose(1, 2)
-    right = logit.masked_fill(apart > _RIGHT, _NEVER).logsumexp(2)
-    wrong = logit.masked_fill(apart < _WRONG, _NEVER).logsumexp(2)
+    never = -1e4
+    right = logit.masked_fill(apart > right_to, never).logsumexp(2)
+    wrong = logit.masked_fill(apart < wrong_from, never).logsumexp(2)
     best = apart.gather(2, logit.detach().argmax(2, keepdim=True))
-    return (torch.logaddexp(right, wrong) - right).mean(), (best <= _RIGHT).float().mean()
+    return (torch.logaddexp(right, wrong) - right).mean(), (best <= right_to).float().mean()
 
 
 class DescriptorRun:
@@ -167,7 +168,7 @@ class DescriptorRun:
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
-        keep = min(_AVERAGE_DECAY, self.step / (self.step + 50))
+        keep = min(0.995, self.step / (self.step + 50))
         torch._foreach_lerp_(list(self.averaged.parameters()), list(self.network.parameters()), 1 - keep)
         self.step += 1
         return torch.stack([loss.detach(), share])

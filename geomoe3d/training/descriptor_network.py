@@ -15,8 +15,6 @@ from geomoe3d.features.pyramid import NUM_RELATIONS
 from geomoe3d.training.descriptor_views import LOOKS, View
 
 WIDTH = 64
-_FPFH = 33
-_INPUT_SCALE = 4.0  # FPFH of length 1 is small beside the biases a layer starts with
 
 
 class Look(nn.Module):
@@ -44,14 +42,16 @@ class DescriptorNetwork(nn.Module):
 
     def __init__(self, width: int = WIDTH) -> None:
         super().__init__()
-        embed = [_mlp(inputs, width, width) for inputs in (_FPFH, 2 * _FPFH, 2 * _FPFH)]
+        fpfh = 33
+        embed = [_mlp(inputs, width, width) for inputs in (fpfh, 2 * fpfh, 2 * fpfh)]
         self.embed = nn.ModuleList(embed)
         for name in LOOKS:
             self.add_module(name, Look(width))
         self.head = _mlp(3 * width, 2 * width, LEARNED)
         with torch.no_grad():
             for layers in embed:
-                next(layers.parameters()).mul_(_INPUT_SCALE)
+                # FPFH of length 1 is small beside the biases a layer starts with.
+                next(layers.parameters()).mul_(4.0)
 
     def forward(self, view: View) -> Tensor:
         """(q, 32) features of the queries."""

@@ -24,9 +24,6 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.training.descriptor_views import Fragment, View, batch_view
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
-_SAME = 0.9  # voxels: a point of the other fragment so near is the same place
-_LEAST_COSINE = 0.5  # of the two normals there
-_LEAST_SHARED = 40
 _BANDS = ((0.35, 2.0), (0.7, 1.0), (np.inf, 0.4))
 """Overlap up to, and how often such a pair is drawn: low overlap in the majority."""
 _MOST_NOISE = (
@@ -125,7 +122,7 @@ class ContrastPairs:
             )
             self._same[k, row] = _same_places(moved, there, *normals)
         same, near = self._same[k, row]
-        if len(same) < _LEAST_SHARED:
+        if len(same) < 40:
             return None
         first = np.resize(rng.permutation(len(same)), self._num_shared)
         queries = [
@@ -164,8 +161,10 @@ def _same_places(
     moved: FloatArray, there: FloatArray, normals: FloatArray, normals_there: FloatArray
 ) -> tuple[IntArray, IntArray]:
     """Rows of points of either fragment that are one place: near each other, and facing the same way."""
-    distance, near = map(np.asarray, cKDTree(there).query(moved, distance_upper_bound=_SAME))
+    # A point of the other fragment within 0.9 voxels is the same place,
+    distance, near = map(np.asarray, cKDTree(there).query(moved, distance_upper_bound=0.9))
     same = np.flatnonzero(np.isfinite(distance))
     cosine = np.einsum("ij,ij->i", normals[same], normals_there[near[same]])
-    same = same[cosine > _LEAST_COSINE]
+    # if its normal turns the same way.
+    same = same[cosine > 0.5]
     return same, near[same]

@@ -27,8 +27,6 @@ from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.networks.geomoe import GeoMoEOutput
 from geomoe3d.networks.layers import weights_from_logits
 
-_MIN_POSITIVE = 3
-
 
 class LossConfig(Section):
     """Weights and forms of the terms."""
@@ -182,7 +180,7 @@ def regression_loss(
     weights = weights_from_logits(logits.float())
     points = coordinates.float()
     fit = weighted_kabsch(points[..., :3].expand(len(weights), -1, -1, -1), points[..., 3:], weights)
-    solved = fit.valid & ((weights > 0).sum(-1) >= _MIN_POSITIVE)
+    solved = fit.valid & ((weights > 0).sum(-1) >= 3)  # three points fix a transform
     # Differences of the motions, so that nothing cancels.
     D = fit.T_target_source - truth.float()
     offset = virtual.float() @ D[..., :3, :3].transpose(-1, -2) + D[..., None, :3, 3]

@@ -16,8 +16,6 @@ from geomoe3d.networks.build import Network
 from geomoe3d.networks.layers import weights_from_logits
 from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch
 
-MAX_POSE_ERROR_DEG = 10.0
-
 
 def label_measures(logits: Tensor, labels: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
     """(B,) precision, recall and f1 of ``logits > 0`` against labels (B, N)."""
@@ -53,7 +51,7 @@ def pose_found(logits: Tensor, matches: Tensor, truth: Tensor) -> Tensor:
     weights = weights_from_logits(logits)
     fit = weighted_eight_point(matches, weights)
     errors = torch.stack(pose_errors_deg(decompose(fit.E, matches, weights), truth))
-    found: Tensor = fit.valid & (errors.amax(0) < MAX_POSE_ERROR_DEG)
+    found: Tensor = fit.valid & (errors.amax(0) < 10.0)  # degrees
     return found
 
 

@@ -30,10 +30,6 @@ from geomoe3d.scoring.surface_channels import NUM_CHANNELS, NUM_POINTS, RAW, Sur
 from geomoe3d.scoring.surfaces import SURFACES
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis, PointCloud
 
-_RIGHT, _WRONG = (0.28, 12.0), (0.6, 20.0)
-_NUM_HYPOTHESES = 14
-_GROUPS, _WIDTH = 4, 48  # pairs in a step; channels
-
 
 @dataclass(frozen=True)
 class Examples:
@@ -107,7 +103,7 @@ def examples_of(
         return None
     said = pipeline.scorers[SURFACES].about(joint)(np.array([h.T_target_source for h in found]))
     ranked = [h for _, h in sorted(zip(said, found, strict=True), key=lambda one: -one[0].factor)]
-    best = distinct(ranked, joint.clouds[0], 3 * joint.inlier_threshold, _NUM_HYPOTHESES)
+    best = distinct(ranked, joint.clouds[0], 3 * joint.inlier_threshold, 14)
     refine = pipeline.refiner.about(joint)
     motions = []
     for hypothesis in (*best, Hypothesis(T)):
@@ -144,15 +140,16 @@ class SurfaceNetwork(nn.Module):
 
     Args:
         mean, std: (C,) of the channels.
+        width: channels of a point.
     """
 
-    def __init__(self, mean: Tensor, std: Tensor) -> None:
+    def __init__(self, mean: Tensor, std: Tensor, width: int = 48) -> None:
         super().__init__()
         self.mean: Tensor
         self.std: Tensor
         self.register_buffer("mean", mean)
         self.register_buffer("std", std)
-        w = _WIDTH
+        w = width
         self.point = nn.Sequential(nn.Linear(NUM_CHANNELS, w), nn.ReLU(), nn.Linear(w, w), nn.ReLU())
         self.head = nn.Sequential(
             nn.Linear(3 * w + NUM_CHANNELS, 64), nn.ReLU(), nn.Dropout(0.15), nn.Linear(64, 32), nn.ReLU(),
@@ -184,7 +181,7 @@ def augmented(channels: Float32Array, rng: np.random.Generator) -> Float32Array:
 
 
 def train(
-    examples: Sequence[Examples], weight: FloatArray, epochs: int, seed: int = 0
+    examples: Sequence[Examples], weight: FloatArray, epochs: int, seed: int = 0, pairs: int = 4
 ) -> Iterator[tuple[int, int, float, SurfaceNetwork]]:
     """Train; yields (step, steps, mean loss, network) every 200 steps and at the end.
 
@@ -193,6 +190,7 @@ def train(
         weight: (n,) how often each pair is drawn beside others.
         epochs: passes over a pair of weight one.
         seed: of all draws.
+        pairs: in a step.
 
     The loss is the binary cross entropy of each hypothesis and half the negative log of what a softmax over the pair
     gives to those that are right.
@@ -202,12 +200,12 @@ def train(
     seen = channels_of(np.concatenate([one.channels[::9, :, ::4] for one in examples]).astype(np.float32))
     flat = torch.from_numpy(seen.reshape(-1, NUM_CHANNELS))
     network = SurfaceNetwork(flat.mean(0), flat.std(0) + 1e-3)
-    steps = max(1, round(epochs * float(weight.sum()) / _GROUPS))
+    steps = max(1, round(epochs * float(weight.sum()) / pairs))
     optimizer = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, steps + 2)
     total, count = 0.0, 0
     for step in range(1, steps + 1):
-        rows = rng.choice(len(examples), min(_GROUPS, len(examples)), replace=False, p=weight / weight.sum())
+        rows = rng.choice(len(examples), min(pairs, len(examples)), replace=False, p=weight / weight.sum())
         some = np.sort(rng.permutation(NUM_POINTS)[: rng.integers(NUM_POINTS // 3, 2 * NUM_POINTS // 3 + 1)])
         loss = torch.zeros(())
         for k in rows:
@@ -235,8 +233,8 @@ def save(network: SurfaceNetwork, file: Path) -> None:
 
 
 def _loss(network: SurfaceNetwork, raw: Float32Array, one: Examples) -> Tensor:
-    right = (one.shift < _RIGHT[0]) & (one.turn < _RIGHT[1])
-    wrong = (one.shift > _WRONG[0]) | (one.turn > _WRONG[1])
+    right = (one.shift < 0.28) & (one.turn < 12.0)  # metres, degrees
+    wrong = (one.shift > 0.6) | (one.turn > 20.0)
     used = right | wrong
     if not used.any():
         return torch.zeros(())

@@ -17,7 +17,6 @@ from geomoe3d.config import Section
 from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
-_BASE_VOXEL = 0.05
 _RANGES = {
     "correspondences": 3,
     "inlier_ratio": 0,
@@ -92,6 +91,7 @@ def generate_pair(rng: np.random.Generator, config: SyntheticConfig) -> Training
     num_true = int(np.clip(round(num * _log_uniform(rng, config.inlier_ratio)), 1, num))
     num_near = min(int(num_true * rng.uniform(*config.near_misses)), (num - num_true) // 2)
     num_like = num_true + num_near
+    base = 0.05  # metres: the voxel size of the room before it is scaled
     room = _Room(rng)
     T = _random_motion(rng, 3.0)
     points, face = room.sample(rng, num, num_like)
@@ -101,17 +101,17 @@ def generate_pair(rng: np.random.Generator, config: SyntheticConfig) -> Training
         _rayleigh(rng, spread, 0.9 * config.inlier_threshold, num_true),
         1.1 * config.inlier_threshold + rng.exponential(3 * spread, num_near),
     ])  # fmt: skip
-    target[:num_like] += room.along(rng, face[:num_like], off * _BASE_VOXEL)
+    target[:num_like] += room.along(rng, face[:num_like], off * base)
     wrong = np.arange(num_like, num)
     target[wrong] = _wrong_targets(rng, room, config, points[wrong], face[wrong])
-    sigma = rng.uniform(*config.noise) * _BASE_VOXEL
+    sigma = rng.uniform(*config.noise) * base
     target = target + rng.normal(0, sigma, target.shape)
     target = target @ T[:3, :3].T + T[:3, 3]
     residual = np.linalg.norm(points @ T[:3, :3].T + T[:3, 3] - target, axis=1)
-    labels: BoolArray = residual < config.inlier_threshold * _BASE_VOXEL
+    labels: BoolArray = residual < config.inlier_threshold * base
     order = rng.permutation(num)
     voxel_size = _log_uniform(rng, config.voxel_size)
-    scale = voxel_size / _BASE_VOXEL
+    scale = voxel_size / base
     T[:3, 3] *= scale
     rows = (np.concatenate([points, target], axis=1)[order] * scale).astype(np.float32)
     return TrainingPair(rows, labels[order], T, voxel_size)

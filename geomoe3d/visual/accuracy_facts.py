@@ -11,10 +11,6 @@ from geomoe3d.runtime.words import counted
 if TYPE_CHECKING:
     from geomoe3d.result import RegistrationResult
 
-_MILLIMETRES = 1000.0
-_LEAST = 1e-3
-"""Fewer millimetres than that no scanner measures."""
-
 
 def length(value: float, unit: str, form: str = ".6g") -> str:
     """A length in words, with the name of its unit where that is known."""
@@ -30,8 +26,9 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
         return [*facts, ("overlap", overlap)]
     near, far = found.sigma_center, found.sigma_farthest
     guess = "" if unit else " if the unit is the metre"
-    small = _MILLIMETRES * near >= _LEAST and far < 1  # else the unit is no metre, or a metre says more
-    metres = f" ({near * _MILLIMETRES:.3g} and {far * _MILLIMETRES:.3g} mm{guess})" if small else ""
+    # Fewer than a thousandth of a millimetre no scanner measures, so the unit is no metre; a whole metre says more.
+    small = 1000.0 * near >= 1e-3 and far < 1
+    metres = f" ({near * 1000.0:.3g} and {far * 1000.0:.3g} mm{guess})" if small else ""
     held = "one deviation" if result.ok else "one deviation, if the answer is right"
     return [
         *facts,

@@ -31,8 +31,6 @@ STATUS_WORDS = {
     "failed": "failed",
 }
 
-MAX_DISTANCE_POINTS = 200_000
-
 
 @dataclass(frozen=True)
 class Drawing:
@@ -174,8 +172,9 @@ def distance_to_target(
     target = view.target_points[np.isfinite(view.target_points).all(axis=1)]
     if not len(target) or not len(drawing.source):
         return np.full(len(drawing.source), np.inf)
-    if len(target) > MAX_DISTANCE_POINTS:
-        target = target[rng.choice(len(target), MAX_DISTANCE_POINTS, replace=False)]
+    most = 200_000
+    if len(target) > most:
+        target = target[rng.choice(len(target), most, replace=False)]
     distance, _ = cKDTree(target - drawing.target_center).query(
         transform_points(motion, drawing.source), distance_upper_bound=limit
     )

@@ -12,7 +12,6 @@ from geomoe3d.visual.drawing import STATUS_COLORS, STATUS_WORDS
 from geomoe3d.visual.page import render_page
 from geomoe3d.visual.view import RegistrationView
 
-MAX_POINTS = 4_000
 _FRAME = '<iframe srcdoc="{}" title="The two clouds" style="width:100%;height:460px;border:1px solid #8884"></iframe>'
 
 
@@ -28,7 +27,5 @@ def notebook_html(status: str, words: str, view: RegistrationView | None) -> str
     text = Markup('<p><b style="color:{}">{}</b>{}</p>').format(color, STATUS_WORDS[status], rest)
     # Plain text: what is added to Markup would be escaped, in the hands of a user too.
     return (
-        str(text)
-        if view is None
-        else str(text + Markup(_FRAME).format(render_page(view, max_points=MAX_POINTS)))
+        str(text) if view is None else str(text + Markup(_FRAME).format(render_page(view, max_points=4_000)))
     )

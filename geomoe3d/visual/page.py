@@ -36,9 +36,6 @@ from geomoe3d.visual.paper import number
 from geomoe3d.visual.templates import base64_floats, render_cloud_page
 from geomoe3d.visual.view import RegistrationView
 
-MAX_POINTS = 50_000
-MAX_LINES = 2_000  # of each kind of correspondence
-
 
 def save_page(view: RegistrationView, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write one registration as a self-contained HTML file.
@@ -55,7 +52,7 @@ def save_page(view: RegistrationView, path: str | os.PathLike[str], *, force: bo
     write_text(path, render_page(view), force=force)
 
 
-def render_page(view: RegistrationView, *, max_points: int = MAX_POINTS, mark: str = "") -> str:
+def render_page(view: RegistrationView, *, max_points: int = 50_000, mark: str = "") -> str:
     """The text of the page that `save_page` writes; the same view gives the same text.
 
     Args:
@@ -162,7 +159,8 @@ def _lines(view: RegistrationView, drawing: Drawing) -> dict[str, Any]:
     else:
         kept, (yes, no) = view.kept(), view.kept_words
         kinds = [(yes, KEPT_COLOR, kept), (no, REJECTED_COLOR, ~kept)]
-    chosen = [choose_rows(mask & finite, MAX_LINES, seed) for _, _, mask in kinds]
+    # At most so many of each kind of correspondence.
+    chosen = [choose_rows(mask & finite, 2_000, seed) for _, _, mask in kinds]
     rows = np.concatenate([*chosen, np.zeros(0, dtype=np.int64)])
     ends = view.correspondences[rows] - np.concatenate([drawing.source_center, drawing.target_center])
     classes = [

@@ -39,8 +39,6 @@ from geomoe3d.visual.xray import xray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MAX_LINES = 300
-
 
 def draw_correspondences(axes: Axes, view: RegistrationView, drawing: Drawing, fineness: float) -> None:
     """Source beside target, turned by the answer, with a line from each source to its target point.
@@ -86,7 +84,7 @@ def draw_correspondences(axes: Axes, view: RegistrationView, drawing: Drawing, f
 
     kinds = _classes(view)
     for label, color, mask, strength in kinds:
-        rows = choose_rows(mask, MAX_LINES // len(kinds), view.result.seed)
+        rows = choose_rows(mask, 300 // len(kinds), view.result.seed)
         total = int(mask.sum())
         drawn = f"{total:,}" if len(rows) == total else f"{total:,}, {len(rows)} drawn"
         lines = np.stack([start[rows][:, [right, up]], end[rows][:, [right, up]]], axis=1)

@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 MAX_POINTS = 60_000
-SIZE_INCHES = (16.0, 14.0)
 DPI = 100
 
 
@@ -91,7 +90,7 @@ def draw_picture(view: RegistrationView, *, fineness: float = 1.0) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(16.0, 14.0), dpi=DPI, facecolor="white")
     drawing = build_drawing(view, max_points=MAX_POINTS)
     rows = figure.add_gridspec(
         3, 1, height_ratios=(1, 1, 1.05), left=0.02, right=0.98, top=0.895, bottom=0.04, hspace=0.16

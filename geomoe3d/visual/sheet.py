@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIZE_INCHES = (8.27, 11.69)
 _DPI = 150
 _LEFT, _RIGHT, _LINE = 0.08, 0.92, 0.0165
 _WIDE = 100  # characters of a line of text
@@ -73,7 +72,7 @@ def draw_sheet(view: RegistrationView) -> Figure:
     from matplotlib.figure import Figure
 
     result = view.result
-    figure = Figure(figsize=SIZE_INCHES, dpi=_DPI, facecolor="white")
+    figure = Figure(figsize=(8.27, 11.69), dpi=_DPI, facecolor="white")  # A4, inches
     drawing = build_drawing(view, max_points=MAX_POINTS)
     figure.text(
         _LEFT, 0.955, "Registration of two scans", fontsize=17, fontweight="bold", color=INK, va="center"

@@ -15,7 +15,6 @@ from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import SOURCE_COLOR, TARGET_COLOR, rgb
 
 Pixels = NDArray[np.uint8]
-_MARGIN = 0.04
 
 
 def pair_thumbnail(
@@ -39,9 +38,8 @@ def pair_thumbnail(
         kind = np.repeat([0, 1], [len(target), len(source)])
         seen = points @ axes.T
         low, high = np.percentile(seen, [0.5, 99.5], axis=0)
-        scale = (1 - 2 * _MARGIN) * min(
-            half / max(high[0] - low[0], 1e-12), height / max((high - low)[1:].max(), 1e-12)
-        )
+        # A margin of 4 % on either side.
+        scale = 0.92 * min(half / max(high[0] - low[0], 1e-12), height / max((high - low)[1:].max(), 1e-12))
         for column, (across, upward, depth) in enumerate(((0, 1, 2), (0, 2, 1))):
             nearness = seen[:, depth] if depth == 2 else -seen[:, depth]
             x = (seen[:, across] - (low + high)[across] / 2) * scale + half / 2

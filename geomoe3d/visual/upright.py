@@ -18,7 +18,6 @@ _CONVENTIONS: dict[str, tuple[FloatArray, float]] = {
     "y up": (np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), 12.0),
     "camera, y down": (np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), 40.0),
 }
-_NORMALS = 2000
 
 
 def upright_axes(points: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, str]:
@@ -78,7 +77,7 @@ def _normals(points: FloatArray, rng: np.random.Generator) -> FloatArray:
     from scipy.spatial import cKDTree
 
     centred = points - points.mean(axis=0)
-    chosen = rng.choice(len(points), size=min(_NORMALS, len(points)), replace=False)
+    chosen = rng.choice(len(points), size=min(2000, len(points)), replace=False)
     _, neighbours = cKDTree(centred).query(centred[chosen], k=16)
     patches = centred[neighbours]
     patches = patches - patches.mean(axis=1, keepdims=True)

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from geomoe3d.types import Alternative
 
 WEIGHT_THRESHOLD = 0.5
-_MATTERS = 1 / 3  # of the answer's score
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,8 @@ class RegistrationView:
         other = self.result.alternative
         if other is None or not np.isfinite(other.T_target_source).all():
             return None
-        return other if self.result.status == "ambiguous" or other.relative_score >= _MATTERS else None
+        # One that scores a third of the answer matters.
+        return other if self.result.status == "ambiguous" or other.relative_score >= 1 / 3 else None
 
     def residuals(self) -> FloatArray:
         """(K,) distance of each moved source point to its target point, cloud units; NaN if no transform."""

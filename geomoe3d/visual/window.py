@@ -31,9 +31,6 @@ from geomoe3d.visual.drawing import (
 )
 from geomoe3d.visual.view import RegistrationView
 
-MAX_POINTS = 200_000
-MAX_LINES = 1_000
-
 
 def show_window(view: RegistrationView) -> None:
     """Show one registration and return when the window is closed.
@@ -57,7 +54,7 @@ def show_window(view: RegistrationView) -> None:
             "'geomoe3d doctor' says what is missing"
         ) from error
 
-    drawing = build_drawing(view, max_points=MAX_POINTS)
+    drawing = build_drawing(view, max_points=200_000)
     shown = WindowContent(view, drawing)
     window = o3d.visualization.VisualizerWithKeyCallback()
     result = view.result
@@ -216,5 +213,5 @@ def _chosen_lines(view: RegistrationView) -> tuple[Any, FloatArray]:
         colors = np.where(kept[:, None], rgb(KEPT_COLOR), rgb(REJECTED_COLOR))
         mask = kept if kept.any() else ~kept
     mask = mask & np.isfinite(view.correspondences).all(axis=1)
-    rows = choose_rows(mask, MAX_LINES, view.result.seed)
+    rows = choose_rows(mask, 1_000, view.result.seed)
     return rows, colors[rows]

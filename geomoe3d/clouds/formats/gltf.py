@@ -31,7 +31,6 @@ _UNDERSTOOD = (  # extensions that change no position, and quantisation, which `
 )
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_MAX_DEPTH = 200
 
 
 @reader(".glb", ".gltf")
@@ -101,7 +100,7 @@ class _Document:
         while waiting:
             index, above, depth = waiting.pop()
             visited += 1
-            if depth > _MAX_DEPTH or visited > 1_000_000:
+            if depth > 200 or visited > 1_000_000:
                 raise FormatError(f"'{self._path}': its nodes are nested in a circle or too deep")
             node = nodes[index]
             place = above @ _placement(node)

@@ -19,9 +19,6 @@ from geomoe3d.errors import DependencyError, FormatError, InputError
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
-_POINTS_PER_BYTE = 100  # far more than any compression gives, of points that differ
-_LARGEST = 2_000_000_000  # of the signed 32 bit integers that LAS stores, with a margin
-
 
 def require_laspy(compressed: bool) -> Any:
     """The module laspy, able to read and write LAZ if ``compressed``.
@@ -162,7 +159,8 @@ def _check_size(path: Path, header: Any) -> None:
     """Hold the header against the file's size, which laspy does not."""
     size = path.stat().st_size
     if header.are_points_compressed:
-        if header.point_count > _POINTS_PER_BYTE * size:
+        # A hundred points in a byte are far more than any compression gives, of points that differ.
+        if header.point_count > 100 * size:
             raise FormatError(
                 f"'{path}': the header says {header.point_count} points, {size} bytes cannot hold them; its "
                 "header is wrong"
@@ -246,7 +244,8 @@ def _write(handle: BinaryIO, cloud: RawCloud, compressed: bool) -> tuple[str, ..
     offset = np.floor((low + high) / 2.0)
     reach = max(float(np.abs(high - offset).max()), float(np.abs(low - offset).max()), 1e-3)
     header.offsets = offset
-    header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / _LARGEST)))
+    # LAS stores signed integers of 32 bits; this leaves a margin.
+    header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / 2_000_000_000)))
     standard = {d.name: d for d in header.point_format.dimensions}
     extra = (
         {}

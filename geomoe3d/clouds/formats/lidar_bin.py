@@ -12,7 +12,6 @@ from geomoe3d.errors import FormatError
 from geomoe3d.runtime.words import counted
 
 _NAMES = ("x", "y", "z", "intensity", "ring")
-_FARTHEST = 1e4  # m; no such sensor reaches it, and bits that are no floats do
 
 
 @reader(".bin")
@@ -36,7 +35,8 @@ def read_bin(path: Path) -> RawCloud:
             table = values.view("<f4").reshape(-1, width)
             with np.errstate(invalid="ignore"):
                 places = np.abs(table[:, :3])
-                is_sweep = bool((~(places > _FARTHEST)).all() and np.isfinite(table[:, 3]).all())
+                # No such sensor reaches 10 km, and bits that are no floats do.
+                is_sweep = bool((~(places > 1e4)).all() and np.isfinite(table[:, 3]).all())
                 rings = table[:, 4] if width == 5 else np.zeros(1)
                 has_rings = bool(((rings == np.rint(rings)) & (rings >= 0) & (rings <= 255)).all())
             if is_sweep and has_rings:

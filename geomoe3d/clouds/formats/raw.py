@@ -19,8 +19,6 @@ from geomoe3d.errors import FormatError
 from geomoe3d.geometry.columns import in_cache
 from geomoe3d.types import FloatArray, IntArray
 
-CHUNK_BYTES = 1 << 24
-
 _ALIASES = {
     **{
         axis: (axis, f"points:{k}", f"points_m_xyz:{k}", f"cartesian{axis}", f"coord_{axis}", other)
@@ -245,8 +243,8 @@ def storable_fields(
 
 
 def chunks(num_rows: int, row_bytes: int) -> Iterator[slice]:
-    """Slices that cover ``num_rows`` in pieces of about `CHUNK_BYTES`."""
-    rows = max(1, CHUNK_BYTES // row_bytes)
+    """Slices that cover ``num_rows`` in pieces of about 16 MiB."""
+    rows = max(1, 2**24 // row_bytes)
     for start in range(0, num_rows, rows):
         yield slice(start, min(start + rows, num_rows))
 

@@ -69,7 +69,6 @@ PROGRAMS: dict[str, list[tuple[str, int, int]]] = {
     for kind, text in _PROGRAMS.items()
 }
 """Kind of room -> pieces, least and most of each."""
-_WEIGHTS = {"living": 4, "bedroom": 3, "kitchen": 4, "office": 5, "bathroom": 1, "meeting": 2, "store": 1}
 
 
 def furnish(
@@ -86,7 +85,8 @@ def furnish(
     """
     area = (room.rect[2] - room.rect[0]) * (room.rect[3] - room.rect[1])
     kinds = [kind for kind in PROGRAMS if kind != "bathroom" or area < 14]
-    weights = np.array([_WEIGHTS[kind] for kind in kinds], dtype=np.float64)
+    often = {"living": 4, "bedroom": 3, "kitchen": 4, "office": 5, "bathroom": 1, "meeting": 2, "store": 1}
+    weights = np.array([often[kind] for kind in kinds], dtype=np.float64)
     kind = str(rng.choice(kinds, p=weights / weights.sum()))
     decorator = _Decorator(rng, solids, room, library, density)
     for _ in range(max(1, round(area / 18))):

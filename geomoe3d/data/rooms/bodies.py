@@ -19,13 +19,7 @@ from geomoe3d.data.rooms.solids import Solids, between, frame_along
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray
 
-_DIAGONAL = (1.8, 5.0)
 _KINDS = ("piece", "pile", "grown")
-_SHARES = (0.15, 0.3, 0.55)
-_TURNS = ((0, 180), (1, 180), (2, 180), (2, 120), (2, 90))  # axis, degrees
-_SAME_PLACE = 0.03  # of the diagonal
-_SAME_SHARE = 0.9
-_SAMPLES = 400
 
 
 def generate_body(rng: np.random.Generator, library: ModelLibrary | None) -> tuple[str, Solids]:
@@ -35,13 +29,14 @@ def generate_body(rng: np.random.Generator, library: ModelLibrary | None) -> tup
         rng: decides it.
         library: models to be taken for furniture, or None for solids alone.
     """
-    kind = str(rng.choice(_KINDS, p=_SHARES))
+    # Kinds by how often they are drawn.
+    kind = str(rng.choice(_KINDS, p=(0.15, 0.3, 0.55)))
     while True:
         solids = {"piece": _piece, "pile": _pile}.get(kind, lambda rng, _: _grown(rng))(rng, library)
         if not looks_the_same_turned(solids):
             break
     low, high = solids.bounds
-    size = float(np.exp(rng.uniform(*np.log(_DIAGONAL)))) / float(np.linalg.norm(high - low))
+    size = float(np.exp(rng.uniform(*np.log((1.8, 5.0))))) / float(np.linalg.norm(high - low))
     # A new object: pieces of a library are shared.
     return kind, replace(solids, vertices=[(v - (low + high) / 2) * size for v in solids.vertices])
 
@@ -59,14 +54,16 @@ def looks_the_same_turned(solids: Solids) -> bool:
     low, high = solids.bounds
     center = (low + high) / 2
     mesh = trimesh.Trimesh(np.concatenate(solids.vertices), np.concatenate(solids.faces), process=False)
-    points = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0]) - center
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 400, seed=0)[0]) - center
     rays = solids.scene()
-    for axis, degrees in _TURNS:
+    # Axis and degrees.
+    for axis, degrees in ((0, 180), (1, 180), (2, 180), (2, 120), (2, 90)):
         turned = Rotation.from_euler("xyz"[axis], degrees, degrees=True).apply(points) + center
         away = rays.compute_distance(
             o3d.core.Tensor.from_numpy(turned.astype(np.float32)), nthreads=1
         ).numpy()
-        if np.mean(away < _SAME_PLACE * np.linalg.norm(high - low)) > _SAME_SHARE:
+        # A turn of symmetry: nine in ten points come to lie within 3 % of the diagonal.
+        if np.mean(away < 0.03 * np.linalg.norm(high - low)) > 0.9:
             return True
     return False
 

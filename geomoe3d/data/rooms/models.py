@@ -24,8 +24,6 @@ from geomoe3d.errors import InputError
 
 MODEL_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
 _CATALOGUE = "PluginFurnitureCatalog.properties"
-_MAX_TRIANGLES = 60_000
-_KEPT = 64
 
 # Kind of piece -> words of a model's name or tags. The first that fits decides.
 _WORDS: dict[str, tuple[str, ...]] = {
@@ -121,7 +119,7 @@ class ModelLibrary:
                 self._cache[key] = _read_piece(model)
             except Exception as error:  # loaders of five formats raise nearly anything
                 self._cache[key] = f"{model.name} ({model.path}): {type(error).__name__}: {error}"
-            if len(self._cache) > _KEPT:
+            if len(self._cache) > 64:  # models are large
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         found = self._cache[key]
@@ -198,8 +196,9 @@ def _add(library: ModelLibrary, model: Model, described: str) -> None:
 
 def _read_piece(model: Model) -> Piece:
     vertices, faces = _read_triangles(model)
-    if len(faces) > _MAX_TRIANGLES:
-        raise InputError(f"{len(faces)} triangles, at most {_MAX_TRIANGLES} are used")
+    most = 60_000
+    if len(faces) > most:
+        raise InputError(f"{len(faces)} triangles, at most {most} are used")
     vertices = vertices[:, [0, 2, 1]] * (-1.0, 1.0, 1.0)  # y up to z up; the front, their +z, to our +y
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     extent = high - low

@@ -17,10 +17,6 @@ from geomoe3d.data.rooms.sensor import Hits
 from geomoe3d.data.rooms.solids import Solids
 from geomoe3d.types import FloatArray
 
-_STRUCTURE = 1.8  # parts that extend so far along two axes are walls, floors and ceilings, metres
-_LEAST_SLOPE = 0.25  # to first order the shift along a grazing ray has no limit
-_FURTHEST = 0.25  # along a ray; more would no longer be the same surface from elsewhere, metres
-
 
 class ReliefSettings(Section):
     """How far surfaces are from planes.
@@ -59,7 +55,8 @@ class Relief:
         strengths = []
         for vertices, faces in zip(solids.vertices, solids.faces, strict=True):
             extent = np.sort(np.ptp(vertices, axis=0))
-            factor = settings.structure if extent[1] > _STRUCTURE else 1.0
+            # Parts that extend so far along two axes, in metres, are walls, floors and ceilings.
+            factor = settings.structure if extent[1] > 1.8 else 1.0
             strengths.append(np.full(len(faces), factor * rng.lognormal(0.0, settings.spread)))
         self._strength = np.concatenate(strengths).astype(np.float32)
         count = settings.waves
@@ -92,8 +89,10 @@ class Relief:
         shift *= self._strength[hits.triangle[met]][:, None]
         normals = hits.normal[met]
         across = np.einsum("ij,ij->i", directions, normals)
-        least = _LEAST_SLOPE * np.linalg.norm(directions, axis=1)
+        # To first order the shift along a grazing ray has no limit.
+        least = 0.25 * np.linalg.norm(directions, axis=1)
         across = np.where(across < 0, np.minimum(across, -least), np.maximum(across, least))
         along = np.einsum("ij,ij->i", shift, normals) / across
-        depth[met] += np.clip(along, -_FURTHEST, _FURTHEST)
+        # Metres along a ray: more would no longer be the same surface from elsewhere.
+        depth[met] += np.clip(along, -0.25, 0.25)
         return Hits(depth.reshape(hits.depth.shape), hits.slope, hits.triangle, hits.normal)

@@ -49,12 +49,6 @@ TRIPOD = ScannerSettings(
 """The whole sphere but for the tripod's foot, twice a degree."""
 
 
-_APART = (1.0, 8.0)
-_CLEARANCE = 0.4
-_HEIGHT = (1.2, 1.7)
-_TILT_DEG = 3.0
-
-
 @dataclass(frozen=True)
 class LaserScanner:
     """Takes scans with one kind of scanner."""
@@ -104,17 +98,17 @@ def stand_scanner(rng: np.random.Generator, scene: Scene, count: int) -> list[Fl
         if len(eyes) == count:
             break
         x0, y0, x1, y1 = scene.areas[int(rng.integers(len(scene.areas)))]
-        x, y, height = (float(v) for v in (*rng.uniform([x0, y0], [x1, y1]), rng.uniform(*_HEIGHT)))
+        x, y, height = (float(v) for v in (*rng.uniform([x0, y0], [x1, y1]), rng.uniform(1.2, 1.7)))
         floor = floor_below(scene, x, y)
         if floor is None:
             continue
         eye = np.array([x, y, floor + height])
         near = eyes[int(rng.integers(len(eyes)))] if eyes else None
-        if near is not None and not _APART[0] < float(np.linalg.norm(eye - near)) < _APART[1]:
+        if near is not None and not 1.0 < float(np.linalg.norm(eye - near)) < 8.0:
             continue
-        if is_free(scene, eye, _CLEARANCE):
+        if is_free(scene, eye, 0.4):  # metres around it
             eyes.append(eye)
-    turns = [[rng.uniform(0, 360), *rng.normal(0, _TILT_DEG, 2)] for _ in eyes]
+    turns = [[rng.uniform(0, 360), *rng.normal(0, 3.0, 2)] for _ in eyes]  # degrees: hardly tilted
     return [
         make_transform(Rotation.from_euler("ZYX", turn, degrees=True).as_matrix(), eye)
         for turn, eye in zip(turns, eyes, strict=True)

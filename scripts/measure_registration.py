@@ -24,7 +24,8 @@ import numpy as np
 from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import BENCHMARKS, BenchmarkPair, load_benchmark
-from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, UNRELATED
+from geomoe3d.evaluation.benchmarks import UNRELATED
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.metrics import is_right, motion_errors
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, translation_error
 from geomoe3d.registration import Registrar
@@ -52,7 +53,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--every", type=int, default=4, help="take every n-th pair")
     parser.add_argument(
-        "--unrelated", type=int, default=NUM_UNRELATED, help="pairs of different scenes to try"
+        "--unrelated", type=int, default=RULES.num_unrelated, help="pairs of different scenes to try"
     )
     parser.add_argument("--no-peer", action="store_true", help="leave KISS-Matcher out")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="configuration")

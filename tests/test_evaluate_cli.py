@@ -13,7 +13,7 @@ from geomoe3d.cli.evaluate import command as evaluate_group
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.clouds.io import save_points
 from geomoe3d.data.threedmatch import write_gt_log
-from geomoe3d.evaluation.benchmarks import NUM_UNRELATED
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.predict import MethodSpec, PredictReport
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 
@@ -176,7 +176,7 @@ def test_the_number_of_unrelated_pairs_is_that_of_the_benchmark() -> None:
     """The command has a figure of its own, so that help comes without loading the evaluation."""
     for name in ("predict", "run"):
         (option,) = (o for o in evaluate_group.commands[name].params if o.name == "num_unrelated")
-        assert option.default == NUM_UNRELATED
+        assert option.default == RULES.num_unrelated
 
 
 def test_nothing_to_score_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

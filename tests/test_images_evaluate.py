@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.errors import FormatError, InputError
+from geomoe3d.images.config import LIMITS
 from geomoe3d.images.evaluate import (
     BASELINE,
-    CORNER_LIMITS,
     Outcome,
     area_under_recall,
     read_pair_list,
@@ -190,4 +190,4 @@ def test_homographies_of_all_three_kinds(tmp_path):
         assert done.exception is None, done.exception
         found = json.loads((tmp_path / "h.json").read_text())
         assert len({one["pair"] for one in found["pairs"]}) == pairs
-        assert found["summary"]["ratio test, RANSAC"][f"auc {CORNER_LIMITS[1]:g}"]["value"] > 60
+        assert found["summary"]["ratio test, RANSAC"][f"auc {LIMITS.corner[1]:g}"]["value"] > 60

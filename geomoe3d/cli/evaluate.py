@@ -207,9 +207,8 @@ def images(
     import json
 
     from geomoe3d.cli.progress import progress_bar
+    from geomoe3d.images.config import LIMITS
     from geomoe3d.images.evaluate import (
-        CORNER_LIMITS,
-        POSE_LIMITS,
         outcomes_of,
         summarise,
         to_json,
@@ -229,7 +228,7 @@ def images(
                 Path(folder), network, pairs, homographies, None if images is None else Path(images)
             )
             advance(number, len(folders))
-    table = summarise(outcomes, CORNER_LIMITS if homographies else POSE_LIMITS)
+    table = summarise(outcomes, LIMITS.corner if homographies else LIMITS.pose)
     click.echo(to_markdown(table, len({(one.scene, one.pair) for one in outcomes})), nl=False)
     if output is not None:
         write_text(Path(output), json.dumps(to_json(outcomes, table)) + "\n", force=force)

@@ -12,14 +12,14 @@ import numpy as np
 from geomoe3d.data.collection import fragment_number, open_collection
 from geomoe3d.data.threedmatch import BENCHMARKS, load_benchmark
 from geomoe3d.errors import InputError
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.records import EvaluationPair
 
 UNRELATED = "unrelated"
-NUM_UNRELATED = 200
 
 
 def load_pairs(
-    benchmark: str, root: str | Path | None = None, *, num_unrelated: int = NUM_UNRELATED
+    benchmark: str, root: str | Path | None = None, *, num_unrelated: int = RULES.num_unrelated
 ) -> list[EvaluationPair]:
     """The pairs of a benchmark, scene by scene.
 

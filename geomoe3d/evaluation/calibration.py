@@ -13,15 +13,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geomoe3d.evaluation.intervals import RESAMPLES, Quantity, Statistic, measure_all
+from geomoe3d.evaluation.config import RULES
+from geomoe3d.evaluation.intervals import Quantity, Statistic, measure_all
 from geomoe3d.evaluation.records import Calibration, Measure, PairScore, ReliabilityBin
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
-NUM_BINS = 10
-
 
 def calibrate(
-    scores: Sequence[PairScore], *, resamples: int = RESAMPLES, seed: int = 0
+    scores: Sequence[PairScore], *, resamples: int = RULES.resamples, seed: int = 0
 ) -> Calibration | None:
     """Reliability, AUROC, risk and acceptance of a run, "right" meaning 15 deg and 0.30 m.
 
@@ -69,7 +68,7 @@ def calibrate(
 
 
 def acceptance(
-    scores: Sequence[PairScore], *, resamples: int = RESAMPLES, seed: int = 0
+    scores: Sequence[PairScore], *, resamples: int = RULES.resamples, seed: int = 0
 ) -> tuple[Measure, Measure]:
     """Share of pairs with status ok in %, and the share of right ones among them (NaN where none is)."""
     accepted = np.array([score.status == "ok" for score in scores], dtype=np.bool_)
@@ -90,18 +89,18 @@ def reliability_bins(confidence: FloatArray, right: BoolArray) -> tuple[Reliabil
     """10 bins of equal width from 0 to 1, the last one closed; confidence (n,) in [0, 1], right (n,)."""
     where = _bin_of(confidence)
     bins = []
-    for k in range(NUM_BINS):
+    for k in range(RULES.num_bins):
         inside = where == k
         count = int(inside.sum())
         mean = float(confidence[inside].mean()) if count else math.nan
         success = float(right[inside].mean()) if count else math.nan
-        bins.append(ReliabilityBin(k / NUM_BINS, (k + 1) / NUM_BINS, count, mean, success))
+        bins.append(ReliabilityBin(k / RULES.num_bins, (k + 1) / RULES.num_bins, count, mean, success))
     return tuple(bins)
 
 
 def calibration_error_of(confidence: FloatArray, right: BoolArray) -> Statistic:
     """The expected calibration error as a function of counts, see `intervals.Statistic`."""
-    gap = np.zeros((len(confidence), NUM_BINS))
+    gap = np.zeros((len(confidence), RULES.num_bins))
     gap[np.arange(len(confidence)), _bin_of(confidence)] = right - confidence
 
     def statistic(counts: FloatArray) -> FloatArray:
@@ -158,5 +157,5 @@ def _percent_of(right: BoolArray, accepted: BoolArray) -> FloatArray:
 
 
 def _bin_of(confidence: FloatArray) -> IntArray:
-    found: IntArray = np.clip(np.floor(confidence * NUM_BINS), 0, NUM_BINS - 1).astype(np.int64)
+    found: IntArray = np.clip(np.floor(confidence * RULES.num_bins), 0, RULES.num_bins - 1).astype(np.int64)
     return found

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomoe3d.errors import InputError
-from geomoe3d.evaluation.intervals import RESAMPLES, Interval, Quantity, Statistic, measure_all, quantile
+from geomoe3d.evaluation.config import RULES
+from geomoe3d.evaluation.intervals import Interval, Quantity, Statistic, measure_all, quantile
 from geomoe3d.evaluation.records import Measure, RunInfo, RunScore
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray
@@ -56,7 +57,7 @@ class Comparison:
     notes: tuple[str, ...]
 
 
-def compare(a: RunScore, b: RunScore, *, resamples: int = RESAMPLES, seed: int = 0) -> Comparison:
+def compare(a: RunScore, b: RunScore, *, resamples: int = RULES.resamples, seed: int = 0) -> Comparison:
     """Run a against run b on the pairs that both answered.
 
     Where no pair changes sides, or all do, a bootstrap of the difference has no spread; there the interval

@@ -10,7 +10,8 @@ import numpy as np
 
 from geomoe3d.data.threedmatch import BENCHMARKS
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.evaluation.benchmarks import NUM_UNRELATED, UNRELATED, load_pairs, thin_out
+from geomoe3d.evaluation.benchmarks import UNRELATED, load_pairs, thin_out
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.records import EvaluationPair, RunInfo
 
 
@@ -33,7 +34,7 @@ class EvaluationSet:
     track: str
     root: str | None = None
     every: int = 1
-    num_unrelated: int = NUM_UNRELATED
+    num_unrelated: int = RULES.num_unrelated
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import InputError
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.records import Measure
 from geomoe3d.types import FloatArray, IntArray
 
-RESAMPLES = 2000
 _BLOCK = 4_000_000
 _UNDEFINED = (math.nan, math.nan)
 
@@ -56,7 +56,7 @@ def measure_all(
     quantities: Mapping[str, Quantity],
     scenes: Sequence[str],
     *,
-    resamples: int = RESAMPLES,
+    resamples: int = RULES.resamples,
     seed: int = 0,
 ) -> dict[str, Measure]:
     """Values with 95 % percentile bootstrap intervals of many quantities over the same n pairs.

@@ -12,18 +12,10 @@ import math
 import numpy as np
 
 from geomoe3d.errors import InputError
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.records import EvaluationPair, Labels, PairScore, Prediction
 from geomoe3d.geometry.se3 import is_motion, project_to_so3, rotation_error_deg, translation_error
 from geomoe3d.types import BoolArray, FloatArray
-
-ROTATION_LIMIT_DEG = 15.0
-"""Degrees; a right motion errs less (strict). PointDSC's code has 15."""
-ROTATION_LIMIT_20_DEG = 20.0
-"""Degrees; the limit that the GeoMoE paper names."""
-TRANSLATION_LIMIT = 0.30
-"""Metres; a right motion errs less (strict)."""
-RMSE_LIMIT = 0.20
-"""Metres; the benchmark's RMSE of a right motion is at most this (not strict, as published)."""
 
 _Triple = tuple[float, float, float] | tuple[None, None, None]
 
@@ -66,7 +58,7 @@ def score_pair(pair: EvaluationPair, prediction: Prediction, *, raw_truth: bool 
     if truth is not None:
         rotation, translation = motion_errors(prediction.T_target_source, truth, raw=raw_truth)
         right = is_right(rotation, translation)
-        right_20 = is_right(rotation, translation, ROTATION_LIMIT_20_DEG)
+        right_20 = is_right(rotation, translation, RULES.rotation_limit_20_deg)
         any_right = right or any(
             is_right(*motion_errors(T, truth, raw=raw_truth)) for T in prediction.hypotheses
         )
@@ -129,14 +121,14 @@ def motion_errors(T: FloatArray | None, T_truth: FloatArray, *, raw: bool = Fals
 
 
 def is_right(
-    rotation_error: float, translation_error: float, rotation_limit: float = ROTATION_LIMIT_DEG
+    rotation_error: float, translation_error: float, rotation_limit: float = RULES.rotation_limit_deg
 ) -> bool:
     """Whether both errors (degrees, metres) are below their limits; one equal to its limit is not.
 
     Errors are compared after rounding to 1e-9, so that a last bit does not decide.
     """
     return (
-        round(rotation_error, 9) < rotation_limit and round(translation_error, 9) < TRANSLATION_LIMIT
+        round(rotation_error, 9) < rotation_limit and round(translation_error, 9) < RULES.translation_limit
         if math.isfinite(rotation_error) and math.isfinite(translation_error)
         else False
     )

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, LEAST_MATCHED, peer
+from geomoe3d.evaluation.config import RULES
+from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, peer
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.timing import StageClock
@@ -186,7 +187,7 @@ def icp_from_identity(
         registration.TransformationEstimationPointToPlane(),
         registration.ICPConvergenceCriteria(max_iteration=iterations),
     )
-    found = len(answer.correspondence_set) >= LEAST_MATCHED
+    found = len(answer.correspondence_set) >= RULES.least_matched
     return Answer(np.array(answer.transformation) if found else None)
 
 

@@ -26,8 +26,6 @@ from geomoe3d.runtime.sources import source_hash
 
 CORRESPONDENCES = frozenset({"correspondences"})
 CLOUDS = frozenset({"clouds"})
-LEAST_MATCHED = 10
-"""Points in contact below which a local method has found nothing."""
 
 Register = Callable[..., Answer]
 """Source (N, 3), target (M, 3), both recentred, the `MethodInput` (thresholds, voxel size, seed), settings by

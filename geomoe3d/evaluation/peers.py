@@ -10,7 +10,8 @@ import numpy as np
 
 from geomoe3d.estimators.weighted_svd import WeightedSvdEstimator
 from geomoe3d.evaluation import open3d_peers  # noqa: F401 - registers them
-from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, LEAST_MATCHED, PEERS, peer
+from geomoe3d.evaluation.config import RULES
+from geomoe3d.evaluation.peer import CLOUDS, CORRESPONDENCES, PEERS, peer
 from geomoe3d.evaluation.records import Answer, MethodInput
 from geomoe3d.filters.spectral import SpectralFilter
 from geomoe3d.geometry.se3 import make_transform, shift_frames
@@ -73,7 +74,7 @@ def small_gicp_from_identity(
         num_threads=1,
         max_iterations=iterations,
     )
-    return Answer(np.array(answer.T_target_source) if answer.num_inliers >= LEAST_MATCHED else None)
+    return Answer(np.array(answer.T_target_source) if answer.num_inliers >= RULES.least_matched else None)
 
 
 @peer("kiss-matcher", "kiss_matcher", "kiss-matcher", inputs=CLOUDS)

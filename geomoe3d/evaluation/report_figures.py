@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike
 
-from geomoe3d.evaluation.metrics import ROTATION_LIMIT_DEG, TRANSLATION_LIMIT
+from geomoe3d.evaluation.config import RULES
 from geomoe3d.evaluation.records import Measure, RunScore
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, IntArray
@@ -229,8 +229,8 @@ def _recall_figure(name: str, runs: Sequence[tuple[int, RunScore]]) -> Figure | 
 def _error_figures(runs: Sequence[tuple[int, RunScore]]) -> list[Figure]:
     found = []
     for what, key, unit, ends, limit in (
-        ("Rotation", "rotation_error_deg", "deg", (0.1, 180.0), (ROTATION_LIMIT_DEG, "15°")),
-        ("Translation", "translation_error", "m", (0.01, 10.0), (TRANSLATION_LIMIT, "0.3 m")),
+        ("Rotation", "rotation_error_deg", "deg", (0.1, 180.0), (RULES.rotation_limit_deg, "15°")),
+        ("Translation", "translation_error", "m", (0.01, 10.0), (RULES.translation_limit, "0.3 m")),
     ):
         series = []
         for run, score in runs:

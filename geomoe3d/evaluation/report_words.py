@@ -31,7 +31,6 @@ LEGEND = (
     "translation: medians over right pairs; inlier F1: labels by the transform, mean over pairs, %; "
     "accepted: % of pairs with status ok; precision: % of those that are right; -: not defined."
 )
-_LONGEST_ERROR = 300
 
 
 def main_row(run: RunScore) -> list[str]:
@@ -52,7 +51,7 @@ def warnings(run: RunScore) -> list[str]:
         first = " ".join(errors[0].split())
         found.append(
             f"'{run.info.label}' ended with an error on {len(errors):,} of {counted(len(run.pairs), 'pair')}; they "
-            f"count as not right; the first: {first[:_LONGEST_ERROR]}{'...' * (len(first) > _LONGEST_ERROR)}"
+            f"count as not right; the first: {first[:300]}{'...' * (len(first) > 300)}"
         )
     if run.raw_truth:
         found.append(

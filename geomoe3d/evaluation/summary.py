@@ -14,8 +14,9 @@ import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.calibration import acceptance, calibrate
-from geomoe3d.evaluation.intervals import RESAMPLES, Quantity, measure_all
-from geomoe3d.evaluation.metrics import RMSE_LIMIT, has_motion, score_pair
+from geomoe3d.evaluation.config import RULES
+from geomoe3d.evaluation.intervals import Quantity, measure_all
+from geomoe3d.evaluation.metrics import has_motion, score_pair
 from geomoe3d.evaluation.records import (
     Curve,
     EvaluationPair,
@@ -82,7 +83,7 @@ def summarise(
     *,
     raw_truth: bool = False,
     seed: int = 0,
-    resamples: int = RESAMPLES,
+    resamples: int = RULES.resamples,
 ) -> RunScore:
     """Everything that reports show of one run.
 
@@ -269,7 +270,7 @@ def _curves(scores: Sequence[PairScore], resamples: int, seed: int) -> dict[str,
 def _rmse_right(scores: Sequence[PairScore]) -> FloatArray:
     """(n,) 0 or 100, NaN where the RMSE is not defined; rounded so that a last bit does not decide."""
     rmse = np.round(_numbers(score.rmse for score in scores), 9)
-    return np.where(np.isnan(rmse), np.nan, 100.0 * (rmse <= RMSE_LIMIT))
+    return np.where(np.isnan(rmse), np.nan, 100.0 * (rmse <= RULES.rmse_limit))
 
 
 def _percent(scores: Sequence[PairScore], test: Callable[[PairScore], bool]) -> Quantity:

@@ -58,4 +58,12 @@ class TruthRules(Section):
     most_median: float = Field(1.0, gt=0, description="pixels: median distance from them")
 
 
+class EvaluationRules(Section):
+    """Limits of the errors over which the area under the curve is taken, as HPatches and LoFTR have them."""
+
+    pose: tuple[float, ...] = Field((5.0, 10.0, 20.0), description="degrees")
+    corner: tuple[float, ...] = Field((3.0, 5.0, 10.0), description="pixels")
+
+
+LIMITS = EvaluationRules()
 KEYPOINTS, POSE, HOMOGRAPHY, TRUTH = KeypointRules(), PoseRules(), HomographyRules(), TruthRules()

@@ -31,7 +31,6 @@ from geomoe3d.images.scenes import choose_pairs, images_in, read_scene
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray
 
-POSE_LIMITS, CORNER_LIMITS = (5.0, 10.0, 20.0), (3.0, 5.0, 10.0)
 BASELINE = "all, RANSAC"
 
 

@@ -19,8 +19,6 @@ from torch import Tensor
 from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.networks.architecture import NetworkConfig
 
-_CHUNK_ROWS = 4096
-
 
 class CompatibilityInputs(NamedTuple):
     """What the network is given beside coordinates.
@@ -105,9 +103,7 @@ def hypothesis_channels(
     places = _place_features(points)
     usable = (fit.valid & ((strength > 0).sum(dim=1) >= 3)).to(points.dtype)
     columns = places[anchors].t().contiguous()
-    score = torch.cat(
-        [(part @ columns).clamp_(min=0).sum(dim=1) for part in torch.split(motions, _CHUNK_ROWS)]
-    )
+    score = torch.cat([(part @ columns).clamp_(min=0).sum(dim=1) for part in torch.split(motions, 4096)])
     score = score * usable
     anchor_score = score[anchors]
     best = motions[anchors[anchor_score.argmax()]]
@@ -115,7 +111,7 @@ def hypothesis_channels(
     supported = torch.cat(
         [
             ((part @ candidates).clamp_(min=0) * anchor_score.square()).amax(dim=1)
-            for part in torch.split(places, _CHUNK_ROWS)
+            for part in torch.split(places, 4096)
         ]
     )
     return torch.stack(

@@ -26,10 +26,6 @@ from geomoe3d.types import FloatArray, IntArray, PreparedCloud
 
 _BANDS = ((0.35, 2.0), (0.7, 1.0), (np.inf, 0.4))
 """Overlap up to, and how often such a pair is drawn: low overlap in the majority."""
-_MOST_NOISE = (
-    0.08  # voxels, standard deviation: half of a sensor's is gone once a voxel's points are averaged
-)
-_LEAST_KEPT = 0.5  # of a thinned fragment's points
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ LOOKS = {
 """Which level looks at which, in the order of evaluation."""
 # FPFH of normals turned over: the first and the third of its three histograms run backwards.
 _TURNED_OVER = torch.cat([torch.arange(11).flip(0), torch.arange(11, 22), torch.arange(22, 33).flip(0)])
-_TINY = 1e-6
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ def torch_relations(at: Grid, of: Grid, rows: Tensor) -> Tensor:
     way = (of.points[rows] - at.points[:, None]) / (4 * of.edge)
     here, there = at.normals[:, None].expand_as(way), of.normals[rows]
     squared, over_here, over_there = (way * way).sum(2), (way * here).sum(2), (way * there).sum(2)
-    distance = squared.sqrt() + _TINY
+    distance = squared.sqrt() + 1e-6
     triple = (here * torch.linalg.cross(way, there)).sum(2)
     found = [distance, over_here, over_there, (there * here).sum(2), triple]
     return torch.stack([*found, over_here / distance, over_there / distance, squared], 2)

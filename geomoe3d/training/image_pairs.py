@@ -25,20 +25,6 @@ from geomoe3d.geometry.essential import (
     symmetric_distance,
 )
 
-_SHARE_AT_DEG = (
-    (0.0, 0.5),
-    (6.0, 0.42),
-    (14.0, 0.27),
-    (26.0, 0.12),
-    (40.0, 0.08),
-    (55.0, 0.05),
-    (180.0, 0.02),
-)
-"""Median share of true matches by the angle of rotation, measured."""
-
-_ASPECTS = (0.5625, 0.75, 1.0, 1.333, 1.5, 1.778, 3.3)
-"""Width over height: upright and wide photographs, and a car's camera."""
-
 
 class ImagePairsConfig(Section):
     """Difficulty of generated image matches."""
@@ -52,6 +38,14 @@ class ImagePairsConfig(Section):
         2.5, ge=1, description="share of true matches: the measured one, times or over at most this"
     )
     any_share: float = Field(0.15, ge=0, le=1, description="pairs whose share is 0.05 to 0.9 instead, evenly")
+    share_at_deg: tuple[tuple[float, float], ...] = Field(
+        ((0, 0.5), (6, 0.42), (14, 0.27), (26, 0.12), (40, 0.08), (55, 0.05), (180, 0.02)),
+        description="median share of true matches by the angle of rotation, measured",
+    )
+    aspects: tuple[float, ...] = Field(
+        (0.5625, 0.75, 1.0, 1.333, 1.5, 1.778, 3.3),
+        description="width over height: upright and wide photographs, and a car's camera",
+    )
     noise: tuple[float, float] = Field(
         (2e-4, 1.2e-3), description="standard deviation of a true match, in longer sides of the image"
     )
@@ -140,11 +134,11 @@ class _Draw:
 def _half_sizes(draw: _Draw, config: ImagePairsConfig) -> tuple[Tensor, Tensor]:
     """Half width and height of both images (B, 2) in focal lengths; seven pairs in ten share a camera."""
     low, high = torch.tensor(config.focal_length).log().tolist()
-    aspects = torch.tensor(_ASPECTS, device=draw.device)
+    aspects = torch.tensor(config.aspects, device=draw.device)
     sizes = []
     for _ in range(2):
         longer = 0.5 / torch.exp(draw.between(low, high, 1))
-        aspect = aspects[(draw.uniform(1) * len(_ASPECTS)).long()]
+        aspect = aspects[(draw.uniform(1) * len(aspects)).long()]
         sizes.append(torch.cat([longer * aspect.clamp(max=1), longer / aspect.clamp(min=1)], dim=1))
     return sizes[0], torch.where(draw.uniform(1) < 0.7, sizes[0], sizes[1])
 
@@ -202,7 +196,7 @@ def _which_are_true(
     draw: _Draw, config: ImagePairsConfig, angle: Tensor, seen: Tensor, surface: Tensor
 ) -> Tensor:
     """(B, N) bool: of the points that both images see as many as SIFT would match, some surfaces better."""
-    knots = angle.new_tensor(_SHARE_AT_DEG)
+    knots = angle.new_tensor(config.share_at_deg)
     place = torch.searchsorted(knots[:, 0].contiguous(), angle.contiguous()).clamp(1, len(knots) - 1)
     low, high = knots[place - 1], knots[place]
     along = (angle - low[:, 0]) / (high[:, 0] - low[:, 0])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import textwrap
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,10 +37,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI = 150
-_LEFT, _RIGHT, _LINE = 0.08, 0.92, 0.0165
-_WIDE = 100  # characters of a line of text
-_MOST_REASONS = 8  # lines
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where text stands on the sheet, in shares of its width and height."""
+
+    left: float = 0.08
+    right: float = 0.92
+    line: float = 0.0165
+    characters: int = 100  # of a line of text
+    reasons: int = 8  # lines
+    dpi: int = 150
+
+
+_AT = _Layout()
 
 
 def save_sheet(view: RegistrationView, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -61,7 +72,7 @@ def save_sheet(view: RegistrationView, path: str | os.PathLike[str], *, force: b
         with warnings.catch_warnings():  # a file name in a script the font lacks shows as boxes: enough
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
             figure.savefig(
-                temporary, format="pdf", dpi=_DPI, metadata={"CreationDate": None, "Title": _title(view)}
+                temporary, format="pdf", dpi=_AT.dpi, metadata={"CreationDate": None, "Title": _title(view)}
             )
 
     write_atomically(path, write, force=force)
@@ -72,13 +83,13 @@ def draw_sheet(view: RegistrationView) -> Figure:
     from matplotlib.figure import Figure
 
     result = view.result
-    figure = Figure(figsize=(8.27, 11.69), dpi=_DPI, facecolor="white")  # A4, inches
+    figure = Figure(figsize=(8.27, 11.69), dpi=_AT.dpi, facecolor="white")  # A4, inches
     drawing = build_drawing(view, max_points=MAX_POINTS)
     figure.text(
-        _LEFT, 0.955, "Registration of two scans", fontsize=17, fontweight="bold", color=INK, va="center"
+        _AT.left, 0.955, "Registration of two scans", fontsize=17, fontweight="bold", color=INK, va="center"
     )
     figure.text(
-        _RIGHT,
+        _AT.right,
         0.955,
         f" {STATUS_WORDS[result.status]}, confidence {number(result.confidence, '.2f')} ",
         fontsize=11,
@@ -89,15 +100,15 @@ def draw_sheet(view: RegistrationView) -> Figure:
         bbox={"boxstyle": "round,pad=0.35", "facecolor": STATUS_COLORS[result.status], "edgecolor": "none"},
     )
     y = _lines(figure, 0.925, _scans(view))
-    reasons = [line for reason in result.reasons for line in textwrap.wrap(f"• {reason}", _WIDE)]
-    more = ["… more in the result file"] if len(reasons) > _MOST_REASONS else []
-    for line in [*reasons[: _MOST_REASONS - len(more)], *more]:
+    reasons = [line for reason in result.reasons for line in textwrap.wrap(f"• {reason}", _AT.characters)]
+    more = ["… more in the result file"] if len(reasons) > _AT.reasons else []
+    for line in [*reasons[: _AT.reasons - len(more)], *more]:
         y = _paragraph(figure, y, line)
     panel = 0.15
     for title, motion in (("Before", drawing.before), ("After", drawing.after)):
         y -= 0.012
         rows = figure.add_gridspec(
-            1, 3, left=_LEFT, right=_RIGHT, top=y - 0.014, bottom=y - panel, wspace=0.04
+            1, 3, left=_AT.left, right=_AT.right, top=y - 0.014, bottom=y - panel, wspace=0.04
         )
         panels = [figure.add_subplot(rows[column]) for column in range(3)]
         panels[0].set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK, pad=4)
@@ -114,20 +125,20 @@ def draw_sheet(view: RegistrationView) -> Figure:
         for row in result.T_target_source[:3]:
             cells = [*(f"{value: .9f}" for value in row[:3]), f"{row[3]: .6f}"]
             figure.text(
-                _LEFT + 0.02, y, "   ".join(cells), family="monospace", fontsize=8.5, color=INK, va="top"
+                _AT.left + 0.02, y, "   ".join(cells), family="monospace", fontsize=8.5, color=INK, va="top"
             )
-            y -= _LINE
+            y -= _AT.line
     else:
         y = _paragraph(figure, y, "No transform was found; the reasons above say why.")
     y = _heading(figure, y - 0.012, "Accuracy")
     y = _lines(figure, y, _measured(view))
     bottom = 0.09
     if y - bottom > 0.1 and drawing.after is not None:
-        box = (_LEFT + 0.04, bottom + 0.03, _RIGHT - _LEFT - 0.04, min(y - bottom - 0.06, 0.16))
+        box = (_AT.left + 0.04, bottom + 0.03, _AT.right - _AT.left - 0.04, min(y - bottom - 0.06, 0.16))
         _draw_distances(figure.add_axes(box), view, drawing, drawing.after)
     versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
     foot = f"Made with {versions or 'geomoe3d'}; seed {result.seed}."
-    figure.text(_LEFT, 0.03, textwrap.fill(foot, 125), fontsize=7, color=SOFT, va="bottom")
+    figure.text(_AT.left, 0.03, textwrap.fill(foot, 125), fontsize=7, color=SOFT, va="bottom")
     return figure
 
 
@@ -185,24 +196,24 @@ def _measured(view: RegistrationView) -> list[tuple[str, str, str]]:
 def _heading(figure: Figure, y: float, text: str) -> float:
     from matplotlib.lines import Line2D
 
-    figure.add_artist(Line2D([_LEFT, _RIGHT], [y + 0.006, y + 0.006], color=FAINT, linewidth=0.8))
-    figure.text(_LEFT, y, text, fontsize=10, fontweight="bold", color=INK, va="top")
-    return y - 1.25 * _LINE
+    figure.add_artist(Line2D([_AT.left, _AT.right], [y + 0.006, y + 0.006], color=FAINT, linewidth=0.8))
+    figure.text(_AT.left, y, text, fontsize=10, fontweight="bold", color=INK, va="top")
+    return y - 1.25 * _AT.line
 
 
 def _paragraph(figure: Figure, y: float, text: str) -> float:
-    lines = textwrap.wrap(text, _WIDE)
+    lines = textwrap.wrap(text, _AT.characters)
     for line in lines:
-        figure.text(_LEFT, y, line, fontsize=8.5, color=INK, va="top", parse_math=False)
-        y -= _LINE
+        figure.text(_AT.left, y, line, fontsize=8.5, color=INK, va="top", parse_math=False)
+        y -= _AT.line
     return y
 
 
 def _lines(figure: Figure, y: float, rows: list[tuple[str, str, str]]) -> float:
     """Rows of a name in its colour and a text."""
     for name, text, color in rows:
-        figure.text(_LEFT, y, name, fontsize=8.5, color=color, va="top", fontweight="bold")
-        for line in textwrap.wrap(text, _WIDE - 14):
-            figure.text(_LEFT + 0.11, y, line, fontsize=8.5, color=INK, va="top", parse_math=False)
-            y -= _LINE
+        figure.text(_AT.left, y, name, fontsize=8.5, color=color, va="top", fontweight="bold")
+        for line in textwrap.wrap(text, _AT.characters - 14):
+            figure.text(_AT.left + 0.11, y, line, fontsize=8.5, color=INK, va="top", parse_math=False)
+            y -= _AT.line
     return y

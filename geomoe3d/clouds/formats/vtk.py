@@ -24,9 +24,12 @@ _TYPES = {
     **{"vtktypeint64": "i8", "vtkidtype": "i8"},
 }
 _CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS")
-_STRIP = 6  # of the numbers of cells' types, as are the following
-_FLAT_CELLS = {5: "triangle", 6: "strip", 7: "polygon", 9: "quadrilateral"}
-_POINT_CELLS = (1, 2)
+_FLAT_CELLS = {  # by the number of the type; 1 and 2 are points
+    5: "triangle",
+    6: "strip",
+    7: "polygon",
+    9: "quadrilateral",
+}
 
 
 class _Body:
@@ -173,7 +176,7 @@ def _faces(
             raise FormatError(f"'{path}': {key} name points beyond the {num_points} that the file holds")
         if (np.diff(begins) < 0).any() or (len(begins) and not 0 <= begins[0] <= begins[-1] <= len(points)):
             raise FormatError(f"'{path}': the offsets of {key} are out of order")
-        of = {"POLYGONS": 7, "TRIANGLE_STRIPS": _STRIP, "VERTICES": 1}.get(key, 0)
+        of = {"POLYGONS": 7, "TRIANGLE_STRIPS": 6, "VERTICES": 1}.get(key, 0)
         num_cells = max(len(begins) - 1, 0)
         types = kinds if key == "CELLS" else np.full(num_cells, of)
         if len(types) != num_cells:
@@ -186,10 +189,10 @@ def _faces(
             first = np.arange(length - 2)
             odd = first % 2  # every second triangle of a strip runs the other way round
             strip = (first + odd, first + 1 - odd, first + 2)
-            corners = strip if kind == _STRIP else (0 * first, first + 1, first + 2)
+            corners = strip if _FLAT_CELLS[kind] == "strip" else (0 * first, first + 1, first + 2)
             found.append(points[(rows[:, None, None] + np.stack(corners, axis=1)).reshape(-1, 3)])
-        plain = np.isin(types, _POINT_CELLS)
-        rest = ~np.isin(types, (*_FLAT_CELLS, *_POINT_CELLS))
+        plain = np.isin(types, (1, 2))
+        rest = ~np.isin(types, (*_FLAT_CELLS, 1, 2))
         if rest.any():
             others.append("lines" if key == "LINES" else "cells that are no faces")
         if plain.any() and len(np.unique(points[np.repeat(plain, lengths)])) < num_points and not found:

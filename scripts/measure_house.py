@@ -23,30 +23,22 @@ PACKAGE = ROOT / "geomoe3d"
 
 KINDS = {
     "of a file format, a protocol, a published data set or a version": (
-        "clouds/formats/*:*",
-        "batch/folder.py:* cli/errors.py:* data/safe_pickle.py:* data/splits.py:* data/rgbd.py:* data/fusion.py:*",
-        "*:*VERSION *:_LARGEST_TEXT *:_LARGEST_TRANSFORM *:_NO_DATA result.py:_ARRAYS doctor.py:GLIBC",
-        "batch/run.py:ALL_THAT_FIT",
+        "clouds/formats/*:* data/splits.py:* data/rgbd.py:* data/fusion.py:*",
+        "*:*VERSION *:_NO_DATA doctor.py:GLIBC batch/run.py:ALL_THAT_FIT",
     ),
     "of mathematics, physics or rounding: three points fix a motion, millimetres in a metre, what avoids 0 / 0": (
-        "*:_E24 *:_BITS *:_HALF *:_BINS *:_TINY *:_EPSILON *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_LIFT *:_MILLIMETRES",
-        "geometry/*:_DAMPING geometry/*:*TOLERANCE images/epipolar.py:_DAMPING *:_MAX_SKEW *:_FPFH *:_depth *:_GOLDEN",
-        "*:MIN_MATCHES *:_LOOSEST",
+        "*:_E24 *:_BITS *:_BINS *:_TINY *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_LIFT *:_depth *:MIN_MATCHES *:_LOOSEST",
     ),
     "of how an answer is shown, said or looked up": (
-        "visual/*:* cli/*:* batch/page.py:* batch/table.py:* evaluation/report_*:* multiway/page.py:*",
-        "multiway/merged.py:_UNKNOWN runtime/progress.py:* evaluation/summary.py:*",
+        "visual/*:* batch/page.py:* evaluation/report_*:* runtime/progress.py:*",
     ),
     "that an option of a verb sets, named in its help": ("multiway/defaults.py:*",),
     "of memory and time, by which the same answer is had: blocks, chunks, caches": (
-        "*:*BLOCK *:*CHUNK* *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE *:_KEPT_CLOUDS *:_KEPT_FEATURES",
-        "batch/memory.py:* features/cache.py:* runtime/*:* evaluation/tracks.py:_HASHED_BYTES networks/*:_PARTS",
-        "*:_MOST_FLAGS",
+        "*:*BLOCK *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE *:_MOST_FLAGS batch/memory.py:*",
     ),
     "of a trained network, whose weights hold with them alone, or of a published architecture": (
-        "networks/*:* features/learned.py:* features/pyramid.py:* training/descriptor_network.py:* images/network.py:*",
-        "maps/level.py:SPACING scoring/surface_channels.py:* scoring/surface_network.py:*",
-        "training/surface_network.py:*",
+        "networks/*:* features/learned.py:* features/pyramid.py:* training/descriptor_network.py:*",
+        "maps/level.py:SPACING scoring/surface_channels.py:*",
     ),
     "of the protocol of a benchmark or of a measurement": (
         "evaluation/*:*",

@@ -306,7 +306,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     posed_scene(tmp_path / "posed" / "a")
     arguments = ["data", "features", str(tmp_path / "posed"), str(tmp_path / "out")]
     assert run(geomoe3d, "geomoe3d", arguments) == 0
-    assert "1 shards made (3 fragments, 3 pairs)" in capsys.readouterr().out
+    assert "1 shard made (3 fragments, 3 pairs)" in capsys.readouterr().out
     assert run(geomoe3d, "geomoe3d", [*arguments, "--group", "train_info"]) == 2
     assert run(geomoe3d, "geomoe3d", [*arguments[:3], str(tmp_path / "coarse"), "--voxel-size", "0.1"]) == 0
     fine, coarse = (open_shard(shard_folders(tmp_path / name)[0]) for name in ("out", "coarse"))

@@ -158,7 +158,7 @@ def test_a_list_of_pairs_as_published(room, tmp_path):
     listed = tmp_path / "pairs.txt"
     listed.write_text("\n".join(" ".join(map(str, row)) for row in rows) + "\n")
     done = run("evaluate", "images", listed, "--images", room)
-    assert "1 pairs" in done.output, done.exception
+    assert "1 pair;" in done.output, done.exception
     listed.write_text("a.png b.png 0 0 1 2\n")
     with pytest.raises(FormatError, match="line 1 has 6 words"):
         read_pair_list(listed)

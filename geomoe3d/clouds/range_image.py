@@ -43,10 +43,11 @@ class RangeImage:
         return cls(viewpoint, axes, np.where(np.isfinite(nearest), around, -np.inf))
 
     def margins(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """For points (N, 3) that are claimed to exist: how far they lie behind what the sensor saw in their direction
+        """For points (..., 3) that are claimed to exist: how far they lie behind what the sensor saw in their direction
         (negative: in space which it saw through; inf where it saw nothing), and their distances from the sensor."""
-        pixel, distance = _pixels(points, self.viewpoint, self.axes, self.nearest.shape)
-        return distance - self.nearest.take(pixel), distance
+        pixel, distance = _pixels(points.reshape(-1, 3), self.viewpoint, self.axes, self.nearest.shape)
+        shape = points.shape[:-1]
+        return (distance - self.nearest.take(pixel)).reshape(shape), distance.reshape(shape)
 
 
 def _viewing_axes(rays: FloatArray) -> FloatArray:

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.clouds.evidence import Met
 from geomoe3d.config import expert
 from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.draws import drawn_rows
-from geomoe3d.types import FloatArray, IntArray, PreparedCloud
+from geomoe3d.types import FloatArray, PreparedCloud
 
 
 @dataclass(frozen=True)
@@ -63,24 +64,16 @@ class SharedSurface:
         (source, target), (rows, back_rows) = self._clouds, self._few if few else self._asked
         R, t = T_target_source[:3, :3], T_target_source[:3, 3]
         moved, turned = source.points @ (scale * R).T + t, source.normals @ R.T
-        ours, theirs = self._nearest(1, moved[rows], reach)
-        backwards, found = self._nearest(0, (target.points[back_rows] - t) @ R / scale, reach / scale)
-        first = np.concatenate([rows[ours], found])
-        second = np.concatenate([theirs, back_rows[backwards]])
-        normals = np.vstack([target.normals[theirs], turned[found]])
+        ours = Met.of(moved[rows], target.tree, reach)
+        back = Met.of((target.points[back_rows] - t) @ R / scale, source.tree, reach / scale)
+        first = np.concatenate([rows[ours.rows], back.nearest])
+        second = np.concatenate([ours.nearest, back_rows[back.rows]])
+        normals = np.vstack([target.normals[ours.nearest], turned[back.nearest]])
         cosines = np.abs(np.einsum("ij,ij->i", turned[first], target.normals[second]))
         agree = cosines > expert().shared_surface.least_cosine
         points, normals = moved[first][agree], normals[agree]
         gaps = np.einsum("ij,ij->i", target.points[second][agree] - points, normals)
-        return Contact(points, normals, gaps, (len(ours) / len(rows), len(found) / len(back_rows)))
-
-    def _nearest(self, which: int, points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
-        """Rows of the points that have a point of a cloud within reach, and the rows of those."""
-        distance, nearest = map(
-            np.asarray, self._clouds[which].tree.query(points, distance_upper_bound=reach)
-        )
-        found = np.flatnonzero(np.isfinite(distance))
-        return found, nearest[found]
+        return Contact(points, normals, gaps, (len(ours.rows) / len(rows), len(back.rows) / len(back_rows)))
 
 
 def robust_weights(gaps: FloatArray, voxel_size: float) -> FloatArray:

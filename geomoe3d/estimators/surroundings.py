@@ -193,10 +193,10 @@ def _turned(points: FloatArray, R: NDArray[Any]) -> FloatArray:
 
 def _depth_in_front(view: RangeImage, points: FloatArray) -> FloatArray:
     """Mean over n points of (n, K, 3), for each K, of how far beyond the threshold they lie in front."""
-    margin, distance = view.margins(points.reshape(-1, 3))
+    margin, distance = view.margins(points)
     known = expert().surroundings
     np.maximum(distance / known.near, 1.0, out=distance)  # what depths are shortened by
     # Where nothing was seen the margin is infinite, and no depth in front.
     depth = np.clip(-margin / distance - 1, 0, known.deepest) / known.deepest
-    means: FloatArray = depth.reshape(points.shape[:2]).mean(0)
+    means: FloatArray = depth.mean(0)
     return means

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geomoe3d.clouds.evidence import Met, kernel
 from geomoe3d.clouds.keypoints import KeypointSurfaces, Surface
 from geomoe3d.estimators.consensus import bundle_weights, distances
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
-from geomoe3d.types import Float32Array, FloatArray, IntArray
+from geomoe3d.types import Float32Array, FloatArray
 
 CHANNELS = (
     "residual_narrow", "residual", "residual_wide", "vote", "degree",
@@ -110,7 +111,7 @@ class AlignedChannels:
         gap = moved[:, self._source_row] - self.rows[None, :, 3:]
         r2 = np.einsum("kni,kni->kn", gap, gap)
         for name, sigma in (("residual_narrow", 0.375), ("residual", 0.75), ("residual_wide", 2.0)):
-            out[:, :, column[name]] = _kernel(r2 / sigma**2)
+            out[:, :, column[name]] = kernel(r2 / sigma**2)
         turned = np.einsum("kij,nj->kni", R, self.source.normals)
         matched = np.einsum("kni,ni->kn", turned[:, self._source_row], self.target.normals[self._target_row])
         back = np.einsum("kji,knj->kni", R, self.target.points[None] - t[:, None])
@@ -120,7 +121,7 @@ class AlignedChannels:
             ("source", moved, turned, self._source_row, self.target),
             ("target", back, np.einsum("kji,nj->kni", R, self.target.normals), self._target_row, self.source),
         ):
-            for key, values in _ask(points.reshape(-1, 3), normals.reshape(-1, 3), other, signed).items():
+            for key, values in _ask(points, normals, other, signed).items():
                 out[:, :, column[f"{name}_{key}"]] = values.reshape(K, -1)[:, row]
         return out
 
@@ -145,29 +146,18 @@ def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
     return [partial(part, start) for start in range(0, len(unit), at_once)]
 
 
-def _kernel(square: FloatArray) -> FloatArray:
-    """exp(-square / 2), not below e^-10: numbers next to zero would slow the network down."""
-    kernel: FloatArray = np.exp(np.maximum(-0.5 * square, -10.0))
-    return kernel
-
-
 def _ask(points: FloatArray, normals: FloatArray, surface: Surface, signed: bool) -> dict[str, FloatArray]:
-    """What a surface says of points (n, 3) with normals that are claimed to exist in its frame."""
-    # A surface point of the other scan is sought within so many inlier thresholds.
-    distance, nearest = surface.tree.query(points, distance_upper_bound=3.0)  # type: ignore[attr-defined]
-    hit = np.flatnonzero(np.isfinite(distance))
-    index: IntArray = nearest[hit]
-    near, plane, cosine = np.zeros((3, len(points)))
-    near[hit] = _kernel((distance[hit] / 1.5) ** 2)
-    off = np.einsum("ni,ni->n", points[hit] - surface.points[index], surface.normals[index])
-    plane[hit] = _kernel((off / 0.5) ** 2)
-    c = np.einsum("ni,ni->n", normals[hit], surface.normals[index])
-    cosine[hit] = c if signed else np.abs(c)
+    """What a surface says of points (K, n, 3) with normals that are claimed to exist in its frame."""
+    met = Met.of(points, surface.tree, 3.0)  # inlier thresholds
+    near, plane, cosine = np.zeros((3, points.size // 3))
+    near[met.rows] = kernel((met.distance / 1.5) ** 2)
+    plane[met.rows] = kernel((met.heights(points, surface.points, surface.normals) / 0.5) ** 2)
+    cosine[met.rows] = met.cosines(normals, surface.normals, signed)
     found = {"near": near, "in_plane": plane, "normal": cosine}
-    seen, front, on = np.zeros((3, len(points)))
+    seen, front, on = np.zeros((3, *points.shape[:-1]))
     if surface.view is not None:
         margin, _ = surface.view.margins(points)
         seen = np.isfinite(margin).astype(np.float64)
         front = np.clip(-margin - 1, 0, 8) / 8
-        on = seen * _kernel(margin**2)
+        on = seen * kernel(margin**2)
     return {**found, "seen": seen, "in_front": front, "on_view": on}

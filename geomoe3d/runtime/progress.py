@@ -13,6 +13,8 @@ from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any, Literal, ParamSpec, TypeVar
 
+from geomoe3d.runtime.words import counted
+
 _LOG_SECONDS = 30.0
 _PATIENCE_S = 1.0
 
@@ -69,7 +71,7 @@ def progress_bar(what: str, *, quiet: bool = False) -> Iterator[Callable[..., No
     """A display of work that is counted, with the time it will take.
 
     Args:
-        what: is counted, such as ``pairs``.
+        what: is counted, such as ``pairs``; one is without the s.
         quiet: shows nothing.
 
     Yields:
@@ -113,7 +115,7 @@ class _LogLines:
         if self._begin is None:
             self._begin = now, done
             kept = f", {done:,} of them done before" if done else ""
-            _say(f"{total:,} {self._what}{kept}")
+            _say(f"{counted(total, self._what[:-1])}{kept}")
             self._said = now
             return
         if now - self._said < _LOG_SECONDS and done < total:
@@ -122,7 +124,7 @@ class _LogLines:
         since, before = self._begin
         left = (now - since) / max(done - before, 1) * (total - done)
         rest = f", {duration(left)} left" if done < total else f" after {duration(now - since)}"
-        _say(f"{done:,} of {total:,} {self._what}{rest}{'  ' * bool(words)}{words}")
+        _say(f"{done:,} of {counted(total, self._what[:-1])}{rest}{'  ' * bool(words)}{words}")
 
 
 def on_terminal() -> bool:

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.clouds.evidence import Met, kernel
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.features.learned import LEARNED
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.runtime.threads import each
-from geomoe3d.types import Float32Array, FloatArray, IntArray, PreparedCloud
+from geomoe3d.types import Float32Array, FloatArray, PreparedCloud
 
 NUM_POINTS = 768
 RAW = (
@@ -110,11 +111,13 @@ class SurfaceChannels:
         moved = side.points @ R.transpose(0, 2, 1) + t
         turned = side.normals @ R.transpose(0, 2, 1)
         reach = _REACH * self._threshold
-        distance, nearest = map(np.asarray, other.tree.query(moved, distance_upper_bound=reach))
-        hit = np.isfinite(distance)
-        y: IntArray = np.where(hit, nearest, 0)
-        off = np.abs(np.einsum("kni,kni->kn", moved - other.points[y], other.normals[y]))
-        cosine = np.einsum("kni,kni->kn", turned, other.normals[y])
+        met = Met.of(moved, other.tree, reach)
+        hit, y, distance, off, cosine = (
+            np.zeros(shape, kind) for kind in (bool, np.int64, float, float, float)
+        )
+        hit.flat[met.rows], y.flat[met.rows], distance.flat[met.rows] = True, met.nearest, met.distance
+        off.flat[met.rows] = np.abs(met.heights(moved, other.points, other.normals))
+        cosine.flat[met.rows] = met.cosines(turned, other.normals, self._signed)
         x = np.broadcast_to(np.arange(NUM_POINTS), shape)
         similar = side.similarity[x, y]
         assert other.features is not None
@@ -124,7 +127,7 @@ class SurfaceChannels:
         seen: FloatArray = np.zeros(shape)
         margin: FloatArray = np.zeros(shape)
         if side.view is not None:
-            behind = side.view.margins(moved.reshape(-1, 3))[0].reshape(shape)
+            behind, _ = side.view.margins(moved)
             saw = np.isfinite(behind)
             seen = saw.astype(np.float64)
             margin = np.clip(np.where(saw, behind, 0.0) / self._threshold, -20.0, 20.0)
@@ -133,7 +136,7 @@ class SurfaceChannels:
             hit,
             np.where(hit, distance, reach) / self._threshold,
             np.minimum(off / self._threshold, _REACH),
-            cosine if self._signed else np.abs(cosine),
+            cosine,
             similar,
             fpfh,
             best - similar,
@@ -154,19 +157,14 @@ def channels_of(raw: Float32Array) -> Float32Array:
     of what was not hit."""
     (hit, r, off, normal, similarity, fpfh, there, here, surprise, seen, margin, planarity, planarity_there, away,
      best) = np.moveaxis(raw, -1, 0)  # fmt: skip
-    near = _kernel(r / 0.5) * hit
-    surprise = surprise / 5
+    near, wide, in_plane, on_view = (kernel(x * x, -np.inf) for x in (r / 0.5, r / 1.5, off / 0.3, margin))
+    near, surprise = near * hit, surprise / 5
     columns = (
-        hit, near, _kernel(r / 1.5) * hit, _kernel(off / 0.3) * hit, normal * hit, similarity * hit, fpfh * hit,
+        hit, near, wide * hit, in_plane * hit, normal * hit, similarity * hit, fpfh * hit,
         there * hit, here * hit, surprise * hit, surprise * near, seen, seen * np.clip(-margin - 1, 0, 8) / 8,
-        seen * _kernel(margin), seen * np.clip(margin - 1, 0, 8) / 8, planarity, planarity_there * hit, away, best,
+        seen * on_view, seen * np.clip(margin - 1, 0, 8) / 8, planarity, planarity_there * hit, away, best,
     )  # fmt: skip
     return np.stack(columns, axis=-1)
-
-
-def _kernel(x: Float32Array) -> Float32Array:
-    found: Float32Array = np.exp(-0.5 * x * x)
-    return found
 
 
 def _planarity(cloud: PreparedCloud) -> FloatArray:

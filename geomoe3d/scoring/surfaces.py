@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geomoe3d.clouds.evidence import Met
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import expert
@@ -169,19 +170,13 @@ class Verifier:
         R, t = motions[:, :3, :3], motions[:, None, :3, 3]
         K, n = len(motions), len(self._points)
         moved = self._points @ R.transpose(0, 2, 1) + t
-        distance, nearest = map(
-            np.asarray, self._tree.query(moved.reshape(-1, 3), distance_upper_bound=self._threshold)
-        )
-        hit = np.flatnonzero(np.isfinite(distance))
-        distance, nearest = distance[hit], nearest[hit]
-        motion, asked = np.divmod(hit, n)
-        turned = (self._normals @ R.transpose(0, 2, 1)).reshape(-1, 3)[hit]
-        cosine = np.einsum("ij,ij->i", turned, self._target.normals[nearest])
-        # Without both sensor positions the normals' signs are a guess, and only their lines can be compared.
-        agrees = (cosine if self._signed else np.abs(cosine)) > expert().surfaces.least_cosine
+        met = Met.of(moved, self._tree, self._threshold)
+        motion, asked = np.divmod(met.rows, n)
+        turned = self._normals @ R.transpose(0, 2, 1)
+        agrees = met.cosines(turned, self._target.normals, self._signed) > expert().surfaces.least_cosine
         # -ln p of a uniform p has mean 1, so chance overlap sums to zero.
-        surprise = -np.log(self._chance(asked[agrees], nearest[agrees])) - 1
-        surprise *= 1 - (distance[agrees] / self._threshold) ** 2
+        surprise = -np.log(self._chance(asked[agrees], met.nearest[agrees])) - 1
+        surprise *= 1 - (met.distance[agrees] / self._threshold) ** 2
         overlap, agreement, distinctiveness = (
             np.bincount(motion[some], weights, minlength=K) / n
             for some, weights in ((slice(None), None), (agrees, None), (agrees, surprise))
@@ -205,7 +200,7 @@ class Verifier:
         for view, points in ((self._target_view, moved), (self._source_view, back)):
             if view is None:
                 continue
-            margins = view.margins(points.reshape(-1, 3))[0].reshape(points.shape[:2])
+            margins, _ = view.margins(points)
             through, seen = (some.sum(1) for some in (margins < -2 * self._threshold, np.isfinite(margins)))
             total += through / (seen + expert().surfaces.visible_floor * points.shape[1])
         return total

@@ -23,7 +23,6 @@ from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _MIN_POINTS = 3
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
-_BITS = 21  # of a 64-bit voxel key, for each axis, at most
 _MOST_FLAGS = 2**26  # bytes spent on counting voxels by a flag each
 
 
@@ -283,7 +282,7 @@ def voxel_keys(points: FloatArray, voxel_size: float, shift: float = 0.0) -> Int
     Raises:
         InputError: the cloud spans more than 2^21 voxels along an axis.
     """
-    limit = 2**_BITS
+    limit = 2**21  # of a 64-bit voxel key, for each axis, at most
     first, last = (np.floor(corner / voxel_size - shift) for corner in bounds(points))
     if (last - first).max() >= limit:
         extent = float(extents(points).max())

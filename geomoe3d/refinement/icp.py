@@ -61,7 +61,8 @@ class CloudAligner:
         self._centre = source.points.mean(0) / source.voxel_size
         self._source, self._target_cloud = source.points / source.voxel_size, target
         ranks = cell_ranks(source.points, source.voxel_size, 0)
-        self._is_first = ranks % np.uint64(expert().alignment.coarse_part) == 0
+        self._all = np.arange(len(source))
+        self._first = np.flatnonzero(ranks % np.uint64(expert().alignment.coarse_part) == 0)
         self._known: dict[bytes, tuple[FloatArray | None, str | None]] = {}
 
     def __call__(self, T_target_source: FloatArray) -> tuple[FloatArray, str | None]:
@@ -89,20 +90,16 @@ class CloudAligner:
         """The motion polished, or None and why not."""
         known, start = expert().alignment, T_target_source.copy()
         start[:3, 3] /= self._voxel
-        rows = self._near(start)
-        some = rows[self._is_first[rows]]
-        if thinned := known.coarse_part * len(some) >= known.least_thinned:
-            first = self._local(some, known.coarse_neighbors)
+        rows = self._near(start, self._first)
+        if known.coarse_part * len(rows) >= known.least_thinned:
+            some = self._local(rows, known.coarse_neighbors)
         else:
-            some, first = rows, self._local(rows, known.normal_neighbors)
-        found = self._aligned(first, start, known.coarse_steps)
+            some = self._local(self._near(start, self._all), known.normal_neighbors)
+        found = self._aligned(some, start, known.coarse_steps)
         if found.T_target_source is None:
             return None, found.problem
         T = found.T_target_source
-        moved = transform_points(T, self._source[some]) - transform_points(start, self._source[some])
-        if np.sum(moved**2, axis=1).max() > (known.margin / 2) ** 2:  # then others may be near now
-            rows, thinned = self._near(T), True
-        every = self._local(rows, known.normal_neighbors) if thinned else first
+        every = self._local(self._near(T, self._all), known.normal_neighbors)
         again = self._aligned(every, T, self._config.max_iterations).T_target_source
         T = T if again is None else again
         T[:3, 3] *= self._voxel
@@ -128,14 +125,14 @@ class CloudAligner:
             max_iterations=max_steps,
         )
 
-    def _near(self, start: FloatArray) -> IntArray:
-        """Rows of the source within the reach of the refinement, and some more, of the target, under ``start``."""
+    def _near(self, start: FloatArray, rows: IntArray) -> IntArray:
+        """Those of the rows that lie within the reach of the refinement, and some more, of the target."""
         reach = (self._config.max_distance + expert().alignment.margin) * self._voxel
-        moved = self._voxel * transform_points(start, self._source)
+        moved = self._voxel * transform_points(start, self._source[rows])
         distance, _ = self._target_cloud.tree.query(
             moved, distance_upper_bound=reach, workers=usable_threads()
         )
-        return np.flatnonzero(np.isfinite(distance))
+        return rows[np.isfinite(distance)]
 
     def _local(self, rows: IntArray, num_neighbors: int) -> LocalCloud:
         """These points of the source as the library takes them, in voxels."""

@@ -132,7 +132,8 @@ class CloudAligner:
         distance, _ = self._target_cloud.tree.query(
             moved, distance_upper_bound=reach, workers=usable_threads()
         )
-        return rows[np.isfinite(distance)]
+        near: IntArray = rows[np.isfinite(distance)]
+        return near
 
     def _local(self, rows: IntArray, num_neighbors: int) -> LocalCloud:
         """These points of the source as the library takes them, in voxels."""

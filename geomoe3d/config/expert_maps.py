@@ -116,10 +116,14 @@ class PlacesExpert(Section):
         "of a fragment with 211 points 20 to 40 matches of three choices were right, 5 to 14 of one",
     )
     seeds: tuple[Annotated[int, Field(ge=1, le=100_000)], Annotated[int, Field(ge=1, le=100_000)]] = constant(
-        (250, 500), "matches", None, "that consensus begins with, at first and later"
+        (100, 500),
+        "matches",
+        None,
+        "that consensus begins with, at first and later",
+        "of 36 queries in three rooms 31 were found at first with 250 and with 100, in a fifth less time",
     )
     refined: tuple[Annotated[int, Field(ge=1, le=100_000)], Annotated[int, Field(ge=1, le=100_000)]] = (
-        constant((30, 60), "hypotheses", None, "that consensus refines, at first and later")
+        constant((10, 60), "hypotheses", None, "that consensus refines, at first and later")
     )
 
 

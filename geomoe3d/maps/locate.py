@@ -161,7 +161,8 @@ class Search:
             proposed = self._query.motions(window, known.per_window[more], more=more)
             if near is not None:
                 proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
-            fresh = [(self._quick(h.T_target_source), h) for h in proposed]
+            least = known.worth_polishing * max((q for q, _ in scored), default=0.0)
+            fresh = [(self._quick(h.T_target_source, least), h) for h in proposed]
             scored += fresh
             best = max(fresh, key=_score, default=None)
             if found is None and times == 1.0 and best is not None and best[0] > max(plain, known.plainest):
@@ -256,9 +257,10 @@ class Search:
             T = make_transform(turn, center + step[3:] - turn @ center) @ T
         return T
 
-    def _quick(self, T: FloatArray) -> float:
+    def _quick(self, T: FloatArray, least: float = 0.0) -> float:
         """Share of the scan's points that lie on the map with an agreeing plane, times exp(-10 v), v the share of map
-        points that stand where the scan's sensor looked through."""
+        points that stand where the scan's sensor looked through; that is not asked where the first is below ``least``.
+        """
         level, voxel = self.level, self.level.voxel_size
         moved = transform_points(T, self.scan.points[self._rows])
         distance, nearest = level.tree.query(moved, distance_upper_bound=2 * voxel)
@@ -266,7 +268,7 @@ class Search:
         normals = self.scan.normals[self._rows][hit] @ T[:3, :3].T
         cosine = np.abs(np.einsum("ij,ij->i", normals, level.normals[np.asarray(nearest)[hit]]))
         agreement = float((cosine > expert().surfaces.least_cosine).sum() / len(moved))
-        if self._view is None or not hit.any():
+        if self._view is None or agreement <= least:
             return agreement
         around = np.array(level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach))
         around = around[np.argsort(self._order[around])[: expert().locating.asked_back]]

@@ -65,7 +65,7 @@ class ConfidenceExpert(Section):
         offset=-1.976, slopes=(1.813, 3.895, -5.902, 1.117, -2.994, 1.447, 0.0)
     )
     # Of clouds that were described again, with the network's margin; of scans whose sensors are known.
-    second_look: MarginFit = MarginFit(offset=-0.265, evidence=0.52, margin=1.067)
+    second_look: MarginFit = MarginFit(offset=-0.523, evidence=0.344, margin=0.952)
     fitted_prior: float = constant(
         0.88,
         "probability",

@@ -130,11 +130,11 @@ class SecondLookConfig(Section):
         "others, its features score; a name as descriptor.name, with its defaults. none, or the same as that: no",
     )
     min_confidence: float = Field(
-        0.98,
+        0.96,
         ge=0,
         le=1,
-        description="an answer found with that descriptor is ok from this confidence on, which was fitted for the "
-        "first one; decision.min_confidence counts where it is higher",
+        description="an answer found with that descriptor, or checked by these scorers, is ok from this confidence on; "
+        "decision.min_confidence counts where it is higher",
     )
     checked_below: float = Field(
         0.985,

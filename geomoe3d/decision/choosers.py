@@ -28,18 +28,27 @@ class Choosers:
     ) -> None:
         self._scorers, self._pair, self._differ = scorers, pair, differ
         self._bound: list[PairScorer] | None = None
+        self._liked: dict[bytes, float] = {}
 
     def likings(self, hypotheses: Sequence[Hypothesis]) -> FloatArray | None:
         """(K,) natural logarithms of what they multiply scores by; None where they say nothing of the pair."""
         if self._bound is None:  # not before it is needed
             self._bound = [scorer.about(self._pair) for scorer in self._scorers.values()]
-        transforms = np.array([h.T_target_source for h in hypotheses])
-        told = [said for ask in self._bound if len(said := ask(transforms)) == len(hypotheses)]
-        if not told:
-            return None
-        factors = np.prod([[score.factor for score in said] for said in told], axis=0)
-        liked: FloatArray = np.log(np.maximum(factors, np.finfo(float).tiny))
-        return liked
+        names = [h.T_target_source.tobytes() for h in hypotheses]
+        new = {
+            name: h.T_target_source
+            for name, h in zip(names, hypotheses, strict=True)
+            if name not in self._liked
+        }
+        if new:  # the others were asked about before
+            transforms = np.array(list(new.values()))
+            told = [said for ask in self._bound if len(said := ask(transforms)) == len(new)]
+            if not told:
+                return None
+            factors = np.prod([[score.factor for score in said] for said in told], axis=0)
+            liked = np.log(np.maximum(factors, np.finfo(float).tiny))
+            self._liked.update(zip(new, liked.tolist(), strict=True))
+        return np.array([self._liked[name] for name in names])
 
     def margin(self, answer: Hypothesis, others: Iterable[Hypothesis | None]) -> float | None:
         """By how much they prefer an answer to the best that is clearly different, a logarithm; see `likings`.

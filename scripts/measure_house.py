@@ -23,7 +23,7 @@ PACKAGE = ROOT / "geomoe3d"
 
 KINDS = {
     "of a file format, a protocol, a published data set or a version": (
-        "clouds/formats/*:* data/splits.py:* data/rgbd.py:* data/fusion.py:*",
+        "clouds/formats/*:* data/splits.py:* data/fusion.py:*",
         "*:*VERSION *:_NO_DATA doctor.py:GLIBC batch/run.py:ALL_THAT_FIT",
     ),
     "of mathematics, physics or rounding: three points fix a motion, millimetres in a metre, what avoids 0 / 0": (
@@ -45,7 +45,7 @@ KINDS = {
         "data/statistics.py:* data/contact.py:*",
     ),
     "of the recipe of generated data or of a training, which its own settings and version identify": (
-        "data/*:* training/*:* images/*:*",
+        "data/*:* training/*:*",
     ),
 }
 """What the constants are that decide no answer of a registration: kind -> patterns ``file:name``, asked in order."""

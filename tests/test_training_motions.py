@@ -23,10 +23,10 @@ from geomoe3d.geometry.se3 import make_transform, rotation_error_deg, transform_
 from geomoe3d.networks.geomoe import GeoMoE
 from geomoe3d.training import motions as motions_module
 from geomoe3d.training.batches import choose_motions, make_batch, make_sample
-from geomoe3d.training.config import TrainConfig, load_train_config
+from geomoe3d.training.config import RULES, TrainConfig, load_train_config
 from geomoe3d.training.losses import verdict_loss
 from geomoe3d.training.measures import evaluate
-from geomoe3d.training.motions import NUM_MOTIONS, propose_motions, with_motions
+from geomoe3d.training.motions import propose_motions, with_motions
 from geomoe3d.training.pairs import ShardFolder, TrainingPair, write_shard
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -155,7 +155,7 @@ def test_motions_are_proposed_once_and_the_run_goes_on(shards: Path, tmp_path: P
     assert len(folder) == 200
     pair = folder[0]
     assert pair.motions is not None
-    assert 1 <= len(pair.motions) <= NUM_MOTIONS
+    assert 1 <= len(pair.motions) <= RULES.num_transforms
     again = propose_motions(shards, out, 250)
     assert (again.made, again.kept) == (1, 2)
     with pytest.raises(OutputError, match="seed"):

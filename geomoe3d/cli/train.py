@@ -90,17 +90,18 @@ def _train(settings: TrainConfig, folder: Path, new: bool, quiet: bool) -> int:
 
 
 def _overfit(settings: TrainConfig, quiet: bool) -> int:
-    from geomoe3d.training.overfit import TARGET_F1, overfit_one_batch
+    from geomoe3d.training.config import RULES
+    from geomoe3d.training.overfit import overfit_one_batch
 
     def report(step: int, measures: dict[str, float]) -> None:
         if not quiet and step % 10 == 0:
             click.echo(f"step {step:4d}  loss {measures['loss']:.4f}  F1 {measures['f1']:.4f}", err=True)
 
     steps, f1 = overfit_one_batch(settings, report=report)
-    reached = f1 > TARGET_F1
+    reached = f1 > RULES.learnt_f1
     click.echo(f"F1 {f1:.4f} after {steps} steps on one batch of {settings.batch_size} pairs", err=False)
     if not reached:
-        click.echo(f"did not reach {TARGET_F1}: network, losses or data are at fault", err=True)
+        click.echo(f"did not reach {RULES.learnt_f1}: network, losses or data are at fault", err=True)
     return 0 if reached else ExitCode.NOT_SURE
 
 

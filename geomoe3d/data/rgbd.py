@@ -22,7 +22,6 @@ from geomoe3d.types import Float32Array, FloatArray
 
 CONVENTIONS = ("7scenes", "tum", "plain")
 _INTRINSICS = ("camera-intrinsics.txt", "K.txt", "intrinsics.txt", "intrinsic_depth.txt")
-_PER_METRE = {"7scenes": 1000.0, "tum": 5000.0, "plain": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,8 @@ def open_recording(
     K = _read_intrinsics(folder) if intrinsics is None else np.asarray(intrinsics, dtype=np.float64)
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         raise InputError(f"focal lengths must be positive and finite, found intrinsics {K.tolist()}")
-    scale = _PER_METRE[convention] if per_metre is None else per_metre
+    usual = 5000.0 if convention == "tum" else 1000.0
+    scale = usual if per_metre is None else per_metre
     if not scale > 0:
         raise InputError(f"depth values per metre must be positive, found {scale}")
     return Recording(folder, convention, frames, K, scale, invalid, skipped)

@@ -110,13 +110,13 @@ class GeoMoEFilter(OutlierFilter):
 
     def look(self, correspondences: Correspondences, *, voxel_size: float) -> Insight:
         """What all layers say, sub-fields and experts, for drawing."""
+        from geomoe3d.networks.config import FIXED
         from geomoe3d.networks.inference import Insight, finite_part
         from geomoe3d.networks.inputs import pair_input
-        from geomoe3d.networks.motion_inputs import MIN_CORRESPONDENCES
 
         result = Insight.blind(len(correspondences), self.config.num_layers)
         seen, part = finite_part(correspondences)
-        if len(seen) < MIN_CORRESPONDENCES:
+        if len(seen) < FIXED.min_correspondences:
             return result
         given: dict[str, NDArray[Any] | None] = {name: getattr(part, name) for name in sorted(self.needs)}
         inputs = pair_input(part.points, voxel_size, self.config, **given)

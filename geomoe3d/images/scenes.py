@@ -22,8 +22,6 @@ from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".tif", ".tiff")
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenGL's camera (y up, z backwards) to OpenCV's."""
 
 
 def read_scene(folder: str | Path) -> ImageScene:
@@ -119,7 +117,8 @@ def _transforms(folder: Path, file: Path) -> Iterator[View]:
             tuple(float(given.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2")),  # type: ignore[arg-type]
             (int(width), int(height)),
         )  # fmt: skip
-        yield View(path, camera, inverse(_matrix(given["transform_matrix"]) @ _FLIP))
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera (y up, z backwards) to OpenCV's
+        yield View(path, camera, inverse(_matrix(given["transform_matrix"]) @ flip))
 
 
 def _llff(folder: Path, file: Path) -> Iterator[View]:

@@ -42,15 +42,6 @@ _USED: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Of each baseline, the keys that mean something to it, beside those that mean something to all."""
 
-BATCH_NORM_EPS, CONTEXT_NORM_EPS = 1e-5, 1e-3
-"""What is added to a variance before its root is taken."""
-
-VERDICT_WIDTH = 64
-"""Hidden channels of the verdict."""
-
-LEAST_MEAN = 0.005
-"""What is added to a channel's mean, a share of the correspondences, before its logarithm is taken."""
-
 _USED_BY_ALL = ("kind", "num_layers", "width", "unit_voxels", "frame")
 
 CHANNEL_WIDTHS: dict[str, int] = {

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.networks.aligned import CHANNELS, PRIOR_KERNEL
-from geomoe3d.networks.architecture import LEAST_MEAN, VERDICT_WIDTH, NetworkConfig
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.config import FIXED
 from geomoe3d.networks.folded_blocks import (
     FoldedExperts,
     FoldedRectifier,
@@ -273,9 +274,9 @@ class _Verdict:
         num = 3 * config.input_width + 1 + 2 * config.width
         self.attend = Product(tensors.affine("attend", config.width, 1)[0])  # the bias cancels
         scale, shift = tensors.scale_shift("norm", num)
-        weight, bias = tensors.affine("hidden", num, VERDICT_WIDTH)
+        weight, bias = tensors.affine("hidden", num, FIXED.verdict_width)
         hidden: tuple[FloatArray, FloatArray] = (weight * scale.T, bias + weight @ shift)
-        self.both = TwoProducts((hidden, tensors.affine("out", VERDICT_WIDTH, 1)))
+        self.both = TwoProducts((hidden, tensors.affine("out", FIXED.verdict_width, 1)))
 
     def __call__(self, channels: Float32Array, field: Float32Array, together: Float32Array) -> Float32Array:
         """(B, N, C), (B, width, N) and (B, N) to (B,)."""
@@ -285,7 +286,7 @@ class _Verdict:
         attention = softmax(self.attend(field), 2)
         pooled = [
             means,
-            np.log(np.maximum(means, np.float32(0)) + np.float32(LEAST_MEAN)),
+            np.log(np.maximum(means, np.float32(0)) + np.float32(FIXED.least_mean)),
             kept,
             np.log(total + np.float32(0.1)),
             field.mean(axis=2),

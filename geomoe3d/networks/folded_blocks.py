@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import CheckpointError
-from geomoe3d.networks.architecture import BATCH_NORM_EPS, CONTEXT_NORM_EPS, NetworkConfig
+from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.config import FIXED
 from geomoe3d.types import Float32Array, FloatArray, IntArray
 
 Affine = tuple[FloatArray, FloatArray]
@@ -65,7 +66,7 @@ class Tensors:
     def scale_shift(self, name: str, width: int) -> Affine:
         """A batch norm in evaluation as x * scale + shift, each (C, 1)."""
         part = self.at(name)
-        scale = part.array("weight", width) / np.sqrt(part.array("running_var", width) + BATCH_NORM_EPS)
+        scale = part.array("weight", width) / np.sqrt(part.array("running_var", width) + FIXED.batch_norm_eps)
         return scale[:, None], (part.array("bias", width) - part.array("running_mean", width) * scale)[
             :, None
         ]
@@ -122,7 +123,7 @@ class NormRelu:
         else:
             h = x - x.mean(axis=-1, keepdims=True)
             variance = np.einsum("bcn,bcn->bc", h, h)[..., None] / np.float32(x.shape[-1])
-            h *= self.scale / np.sqrt(variance + np.float32(CONTEXT_NORM_EPS))
+            h *= self.scale / np.sqrt(variance + np.float32(FIXED.context_norm_eps))
         h += self.shift
         return relu(h)
 

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from geomoe3d.networks.architecture import Frame
+from geomoe3d.networks.config import FIXED
 from geomoe3d.networks.seeded_motions import length_affinity, seeded_motion
-
-THRESHOLD_VOXELS = 2.0
 
 
 def canonical_rotations(points: Tensor, voxel_size: float, frame: Frame) -> tuple[Tensor, Tensor]:
@@ -33,7 +32,7 @@ def canonical_rotations(points: Tensor, voxel_size: float, frame: Frame) -> tupl
     A = torch.eye(3, dtype=torch.float64) if frame == "hypothesis" else principal_axes(points[:, :3])
     if frame == "principal":
         return A, principal_axes(points[:, 3:])
-    return A, A @ _hypothesis(points, THRESHOLD_VOXELS * voxel_size).T
+    return A, A @ _hypothesis(points, FIXED.threshold_voxels * voxel_size).T
 
 
 def principal_axes(points: Tensor) -> Tensor:

@@ -13,8 +13,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from geomoe3d.networks.architecture import LEAST_MEAN, VERDICT_WIDTH, NetworkConfig
+from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.networks.blocks import GraphAttention, PointCN, SubFieldPool, TwoLayer
+from geomoe3d.networks.config import FIXED
 from geomoe3d.networks.moe import DenseFeedForward, FMoE, Routing
 from geomoe3d.networks.norms import BatchNorm, Pointwise, norm_relu_linear
 
@@ -240,8 +241,8 @@ class MotionVerdict(nn.Module):
         super().__init__()
         self.attend = Pointwise(config.width, 1)
         self.norm = BatchNorm(3 * config.input_width + 1 + 2 * config.width)
-        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, VERDICT_WIDTH)
-        self.out = Pointwise(VERDICT_WIDTH, 1)
+        self.hidden = Pointwise(3 * config.input_width + 1 + 2 * config.width, FIXED.verdict_width)
+        self.out = Pointwise(FIXED.verdict_width, 1)
 
     def forward(self, channels: Tensor, field: Tensor, together: Tensor, mask: Tensor | None) -> Tensor:
         """Verdicts of a batch.
@@ -269,7 +270,7 @@ class MotionVerdict(nn.Module):
         pooled = torch.cat(
             [
                 means,
-                (means.clamp(min=0) + LEAST_MEAN).log(),
+                (means.clamp(min=0) + FIXED.least_mean).log(),
                 kept,
                 (total + 0.1).log(),
                 (field * real).sum(2) / count,

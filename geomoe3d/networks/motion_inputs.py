@@ -14,10 +14,9 @@ from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.errors import InputError, NonFiniteError
 from geomoe3d.networks.aligned import AlignedChannels
 from geomoe3d.networks.architecture import NetworkConfig
+from geomoe3d.networks.config import FIXED
 from geomoe3d.networks.neighbors import nearest_rows
 from geomoe3d.types import Float32Array, FloatArray
-
-MIN_CORRESPONDENCES = 3
 
 
 class MotionInputs:
@@ -71,8 +70,10 @@ def centred_voxels(
         raise InputError(
             f"correspondences must be (N, {config.correspondence_dim}) for this network, found {points.shape}"
         )
-    if len(points) < MIN_CORRESPONDENCES:
-        raise InputError(f"{len(points)} correspondences; the network needs at least {MIN_CORRESPONDENCES}")
+    if len(points) < FIXED.min_correspondences:
+        raise InputError(
+            f"{len(points)} correspondences; the network needs at least {FIXED.min_correspondences}"
+        )
     if not (np.isfinite(voxel_size) and voxel_size > 0):
         raise InputError(f"voxel_size must be positive, found {voxel_size}")
     if not np.isfinite(points).all():

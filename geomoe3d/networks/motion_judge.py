@@ -13,9 +13,10 @@ import numpy as np
 
 from geomoe3d.clouds.keypoints import KeypointSurfaces
 from geomoe3d.errors import CheckpointError
+from geomoe3d.networks.config import FIXED
 from geomoe3d.networks.folded import FoldedGeoMoE, FoldedOutput
 from geomoe3d.networks.inference import Insight, finite_part
-from geomoe3d.networks.motion_inputs import MIN_CORRESPONDENCES, MotionInputs
+from geomoe3d.networks.motion_inputs import MotionInputs
 from geomoe3d.networks.weight_files import WeightCard, read_weights
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import Correspondences, FilterOutput, FloatArray, IntArray
@@ -86,7 +87,7 @@ class MotionJudge:
         """
         seen, part = finite_part(correspondences)
         inputs = None
-        if len(seen) >= MIN_CORRESPONDENCES:
+        if len(seen) >= FIXED.min_correspondences:
             views = part.viewpoints or (None, None)
             inputs = MotionInputs(part.points, views, voxel_size, self.config, surfaces)
         return PairJudge(self._network, inputs, seen, len(correspondences))

@@ -15,7 +15,7 @@ import torch.nn.functional as F  # noqa: N812 - the field's name for it
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from geomoe3d.networks.architecture import CONTEXT_NORM_EPS
+from geomoe3d.networks.config import FIXED
 
 _recomputing = threading.local()
 
@@ -106,7 +106,7 @@ def norm_relu_linear(x: Tensor, norm: BatchNorm, linear: Pointwise, mask: Tensor
 class ContextNorm(nn.Module):
     """Each pair's channels to zero mean and unit (biased) variance over its own correspondences."""
 
-    eps = CONTEXT_NORM_EPS
+    eps = FIXED.context_norm_eps
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, C, N) to the same shape."""

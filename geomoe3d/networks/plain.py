@@ -12,11 +12,10 @@ from torch import Tensor
 
 from geomoe3d.errors import CheckpointError
 from geomoe3d.networks.build import Network
-from geomoe3d.networks.frames import THRESHOLD_VOXELS
+from geomoe3d.networks.config import FIXED
 from geomoe3d.networks.inference import finite_part
 from geomoe3d.networks.inputs import pair_input
 from geomoe3d.networks.layers import weights_from_logits
-from geomoe3d.networks.motion_inputs import MIN_CORRESPONDENCES
 from geomoe3d.networks.seeded_motions import motion_residuals, seeded_motion, spread_seeds
 from geomoe3d.types import Correspondences, FilterOutput
 
@@ -47,7 +46,7 @@ class PlainNetwork:
         weights = np.zeros(len(correspondences))
         logits = np.full(len(correspondences), -np.inf)
         seen, part = finite_part(correspondences)
-        if len(seen) < MIN_CORRESPONDENCES:
+        if len(seen) < FIXED.min_correspondences:
             return FilterOutput(weights, logits=logits)
         wanted = set(self.config.extra_channels)
         channels = {
@@ -69,7 +68,7 @@ class PlainNetwork:
     ) -> tuple[Tensor, Tensor]:
         """Weights of the rows under the best motion of the seeds, and the log odds that these stand for."""
         source, target = coordinates[:, :3], coordinates[:, 3:]
-        threshold = THRESHOLD_VOXELS / self.config.unit_voxels
+        threshold = FIXED.threshold_voxels / self.config.unit_voxels
         apart = torch.cdist(source, source) - torch.cdist(target, target)
         affinity = similarity.double() * (1 - (apart / threshold).square()).clamp(min=0)
         seeds = spread_seeds(verdict, source, threshold)

@@ -28,17 +28,13 @@ from geomoe3d.networks.motion_inputs import MotionInputs
 from geomoe3d.networks.neighbors import neighbors_in_batch
 from geomoe3d.runtime.threads import THREADS_VARIABLE
 from geomoe3d.training.augment import augment
-from geomoe3d.training.config import DataConfig, TrainConfig
+from geomoe3d.training.config import RULES, DataConfig, TrainConfig
 from geomoe3d.training.fragment_pairs import FragmentPairs
 from geomoe3d.training.image_pairs import ImagePairsConfig, generate_matches
 from geomoe3d.training.losses import network_motion
 from geomoe3d.training.pairs import PairDataset, ShardFolder, TrainingPair
 from geomoe3d.training.synthetic import SyntheticPairs
 from geomoe3d.types import BoolArray, FloatArray
-
-_VALIDATION_SEED = 1_000_003
-MAX_ROTATION_DEG = 15.0
-MAX_TRANSLATION_VOXELS = 6.0
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,7 @@ def open_training(config: TrainConfig) -> PairDataset | ImagePairs:
 
 def open_validation(config: TrainConfig) -> PairDataset:
     """Validation pairs; generated ones come from other rooms, the same for every training seed."""
-    return open_pairs(config.data.validation, config.data, _VALIDATION_SEED)
+    return open_pairs(config.data.validation, config.data, RULES.validation_seed)
 
 
 def make_sample(
@@ -172,8 +168,8 @@ def choose_motions(
     T = pair.T_target_source
     right = np.array(
         [
-            rotation_error_deg(m, T) < MAX_ROTATION_DEG
-            and np.linalg.norm(m[:3, 3] - T[:3, 3]) < MAX_TRANSLATION_VOXELS * pair.voxel_size
+            rotation_error_deg(m, T) < RULES.max_rotation_deg
+            and np.linalg.norm(m[:3, 3] - T[:3, 3]) < RULES.max_translation_voxels * pair.voxel_size
             for m in pair.motions
         ]
     )
@@ -321,7 +317,7 @@ def validation_samples(config: TrainConfig) -> list[Sample]:
 
 
 def _image_samples(config: TrainConfig) -> list[Sample]:
-    pairs = ImagePairs(config.data.images, config.network, _VALIDATION_SEED)
+    pairs = ImagePairs(config.data.images, config.network, RULES.validation_seed)
     samples = []
     for number in range(config.validation.num_pairs):
         one = pairs.batch(1, number)

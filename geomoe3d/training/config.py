@@ -127,6 +127,20 @@ class TrainConfig(Section):
         return self
 
 
+class TrainingRules(Section):
+    """How runs are measured and what they store; these are no settings of one."""
+
+    validation_seed: int = Field(1_000_003, description="of generated pairs to validate on, unlike any run's")
+    max_rotation_deg: float = Field(15.0, gt=0, description="degrees; a transform that errs less is right")
+    max_translation_voxels: float = Field(6.0, gt=0, description="voxels; likewise")
+    learnt_f1: float = Field(0.99, gt=0, lt=1, description="from that F1 on a batch is learnt by heart")
+    num_transforms: int = Field(24, ge=1, description="stored for a pair at most")
+    pairs_per_shard: int = Field(100, ge=1, description="that are proposed for at a time")
+
+
+RULES = TrainingRules()
+
+
 def load_train_config(path: str | None = None, assignments: list[str] | None = None) -> TrainConfig:
     """The run of a YAML file (None: defaults) with ``key=value`` changes.
 

@@ -14,7 +14,8 @@ from geomoe3d.geometry.essential import decompose, pose_errors_deg, weighted_eig
 from geomoe3d.geometry.kabsch import weighted_kabsch
 from geomoe3d.networks.build import Network
 from geomoe3d.networks.layers import weights_from_logits
-from geomoe3d.training.batches import MAX_ROTATION_DEG, MAX_TRANSLATION_VOXELS, Batch, Sample, make_batch
+from geomoe3d.training.batches import Batch, Sample, make_batch
+from geomoe3d.training.config import RULES
 
 
 def label_measures(logits: Tensor, labels: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
@@ -42,7 +43,7 @@ def motion_found(logits: Tensor, coordinates: Tensor, truth: Tensor, unit_voxels
     cosine = (product.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     angle = torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))
     offset = (T[:, :3, 3] - truth[:, :3, 3]).norm(dim=1) * unit_voxels
-    found: Tensor = fit.valid & (angle < MAX_ROTATION_DEG) & (offset < MAX_TRANSLATION_VOXELS)
+    found: Tensor = fit.valid & (angle < RULES.max_rotation_deg) & (offset < RULES.max_translation_voxels)
     return found
 
 

@@ -25,14 +25,13 @@ from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
+from geomoe3d.training.config import RULES
 from geomoe3d.training.fragment_pairs import as_training_pair
 from geomoe3d.training.pairs import TrainingPair, write_shard
 from geomoe3d.types import BoolArray, Correspondences
 
-NUM_MOTIONS = 24
 PROPOSER_VERSION = 3
 """Raise it with every change of what consensus proposes: motions of two kinds must not share a folder."""
-PAIRS_PER_SHARD = 100
 SETTINGS = DrawSettings(
     usual_share=0.7, keypoints=(250, 2000), band_shares=(0.5, 0.3, 0.2), min_inliers=0, whole_share=0.4
 )
@@ -84,11 +83,11 @@ def propose_motions(
         raise OutputError(f"cannot make the folder '{out}': {error.strerror}") from None
     _check_identity(
         out / _IDENTITY,
-        {"seed": seed, "motions": NUM_MOTIONS, "proposer": PROPOSER_VERSION, "pool": pool_identity},
+        {"seed": seed, "motions": RULES.num_transforms, "proposer": PROPOSER_VERSION, "pool": pool_identity},
     )
     jobs = [
-        _Job(Path(features), out / f"motions-{seed:02d}-{k:05d}", seed, k * PAIRS_PER_SHARD)
-        for k in range(-(-num_pairs // PAIRS_PER_SHARD))
+        _Job(Path(features), out / f"motions-{seed:02d}-{k:05d}", seed, k * RULES.pairs_per_shard)
+        for k in range(-(-num_pairs // RULES.pairs_per_shard))
     ]
     todo = [job for job in jobs if not job.target.exists()]
     done, failed = len(jobs) - len(todo), []
@@ -132,7 +131,7 @@ def _make(job: _Job) -> None:
     pairs = list(_pairs(_pool(job.features, job.seed), job.first))
     if not pairs:
         raise InputError(
-            f"pairs {job.first} to {job.first + PAIRS_PER_SHARD - 1} of '{job.features}': consensus proposes "
+            f"pairs {job.first} to {job.first + RULES.pairs_per_shard - 1} of '{job.features}': consensus proposes "
             "no transform for any; their fragments hold too few points, compute features on a finer grid"
         )
     write_shard(job.target, pairs)
@@ -144,7 +143,7 @@ def _pool(features: Path, seed: int) -> FragmentPool:
 
 
 def _pairs(pool: FragmentPool, first: int) -> Iterator[TrainingPair]:
-    for index in range(first, first + PAIRS_PER_SHARD):
+    for index in range(first, first + RULES.pairs_per_shard):
         try:
             drawn = pool[index]
             pair = as_training_pair(drawn)
@@ -156,7 +155,7 @@ def _pairs(pool: FragmentPool, first: int) -> Iterator[TrainingPair]:
 
 
 def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> TrainingPair:
-    """The pair with at most `NUM_MOTIONS` motions proposed for it, best first; the sensors are at zero.
+    """The pair with at most `RULES.num_transforms` motions proposed for it, best first; the sensors are at zero.
 
     Every second one is drawn closer by the keypoints: bare correspondences show the network such motions,
     registration shows it those that consensus fitted. Described fragments have their sensor at zero, see
@@ -166,7 +165,7 @@ def with_motions(pair: TrainingPair, mutual: BoolArray | None = None) -> Trainin
         pair: with at least 3 correspondences.
         mutual: (N,) which matches are mutual, where others are to weigh less, as in registration.
     """
-    estimator = ConsensusEstimator(num_hypotheses=NUM_MOTIONS)
+    estimator = ConsensusEstimator(num_hypotheses=RULES.num_transforms)
     threshold = _PROPOSING.inlier_threshold * pair.voxel_size
     at_zero = (np.zeros(3), np.zeros(3))
     rows = Correspondences(pair.correspondences.astype(np.float64), mutual=mutual, viewpoints=at_zero)

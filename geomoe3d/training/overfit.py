@@ -9,11 +9,9 @@ import torch
 
 from geomoe3d.networks.build import build_network
 from geomoe3d.training.batches import first_batch
-from geomoe3d.training.config import TrainConfig
+from geomoe3d.training.config import RULES, TrainConfig
 from geomoe3d.training.distributed import Process, choose_device
 from geomoe3d.training.step import Updater
-
-TARGET_F1 = 0.99
 
 
 def overfit_one_batch(
@@ -46,6 +44,6 @@ def overfit_one_batch(
         f1 = measures["f1"]
         if report is not None:
             report(step, measures)
-        if f1 > TARGET_F1:
+        if f1 > RULES.learnt_f1:
             return step, f1
     return max_steps, f1

@@ -21,8 +21,6 @@ from geomoe3d.runtime.words import counted
 
 State = Literal["ok", "missing", "broken"]
 
-GLIBC = (2, 35)
-"""Oldest glibc that Open3D's wheels load on."""
 
 TORCH = "torch==2.13.0"
 """What the set-up script installs; any newer one will do."""
@@ -195,13 +193,14 @@ def _check_python(machine: Machine) -> Finding:
 def _check_glibc(machine: Machine) -> list[Finding]:
     if machine.system() != "linux":
         return []
-    version, needed = machine.glibc(), ".".join(map(str, GLIBC))
+    glibc = (2, 35)  # the oldest that Open3D's wheels load on
+    version, needed = machine.glibc(), ".".join(map(str, glibc))
     mend = "use Debian 12, Ubuntu 22.04, Fedora 36 or newer; the C library cannot be exchanged by itself"
     if version is None:
         problem = f"this C library is not glibc; Open3D needs glibc {needed}"
         return [Finding("glibc", "missing", problem, mend)]
     text = ".".join(map(str, version))
-    if version < GLIBC:
+    if version < glibc:
         return [Finding("glibc", "broken", f"{text}, but Open3D needs {needed} or newer", mend)]
     return [Finding("glibc", "ok", text)]
 

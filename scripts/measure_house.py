@@ -23,26 +23,26 @@ PACKAGE = ROOT / "geomoe3d"
 
 KINDS = {
     "of a file format, a protocol, a published data set or a version": (
-        "clouds/formats/*:* data/splits.py:* data/fusion.py:*",
-        "*:*VERSION *:_NO_DATA doctor.py:GLIBC batch/run.py:ALL_THAT_FIT",
+        "data/splits.py:* data/fusion.py:*",
+        "*:*VERSION *:_NO_DATA batch/run.py:ALL_THAT_FIT",
     ),
     "of mathematics, physics or rounding: three points fix a motion, millimetres in a metre, what avoids 0 / 0": (
-        "*:_E24 *:_BITS *:_BINS *:_TINY *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_LIFT *:_depth *:MIN_MATCHES *:_LOOSEST",
+        "*:_BITS *:_BINS *:_TINY *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_depth *:MIN_MATCHES *:_LOOSEST",
     ),
     "of how an answer is shown, said or looked up": (
-        "visual/*:* batch/page.py:* evaluation/report_*:* runtime/progress.py:*",
+        "visual/*:* evaluation/report_*:* runtime/progress.py:*",
     ),
     "that an option of a verb sets, named in its help": ("multiway/defaults.py:*",),
     "of memory and time, by which the same answer is had: blocks, chunks, caches": (
-        "*:*BLOCK *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE *:_MOST_FLAGS batch/memory.py:*",
+        "*:*BLOCK *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE batch/memory.py:*",
     ),
     "of a trained network, whose weights hold with them alone, or of a published architecture": (
-        "networks/*:* features/learned.py:* features/pyramid.py:* training/descriptor_network.py:*",
+        "networks/*:* features/learned.py:* features/pyramid.py:*",
         "maps/level.py:SPACING scoring/surface_channels.py:*",
     ),
     "of the protocol of a benchmark or of a measurement": (
         "evaluation/*:*",
-        "data/statistics.py:* data/contact.py:*",
+        "data/statistics.py:*",
     ),
     "of the recipe of generated data or of a training, which its own settings and version identify": (
         "data/*:* training/*:*",

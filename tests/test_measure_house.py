@@ -42,7 +42,7 @@ def test_circles_are_found_through_functions_but_not_through_type_checks(house, 
 
 
 def test_a_constant_is_of_the_first_kind_that_fits_and_else_decides(house):
-    assert house.kind_of("clouds/formats/las.py:_LARGEST").startswith("of a file format")
+    assert house.kind_of("data/splits.py:_TEST").startswith("of a file format")
     assert house.kind_of("maps/store.py:VERSION").startswith("of a file format")
     assert house.kind_of("visual/page.py:MAX_POINTS").startswith("of how an answer is shown")
     assert house.kind_of("decision/scale.py:_UNITS").startswith("of mathematics")

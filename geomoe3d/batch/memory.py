@@ -13,10 +13,7 @@ from geomoe3d.runtime.provenance import usable_cores
 from geomoe3d.runtime.words import counted
 
 _BASE_BYTES = 750 * 2**20  # libraries, torch among them, a block of the similarity matrix, described clouds
-_PER_FILE_BYTE = 5  # binary PLY of single floats: 12 bytes a point in the file, some 60 while it is thinned
-_PER_COMPRESSED_BYTE = 40
 _COMPRESSED = {".laz", ".npz", ".e57", ".glb"}
-_KEPT_FREE = 0.1
 
 
 def worker_bytes(rows: Iterable[PairRow]) -> int:
@@ -54,7 +51,8 @@ def choose_workers(wanted: int | None, each: int) -> tuple[int, int | None]:
     memory = Machine().memory()
     if memory is None:
         return wanted or usable_cores(), None
-    free = int((1 - _KEPT_FREE) * memory[0])
+    # A tenth is kept free.
+    free = int((1 - 0.1) * memory[0])
     fitting = max(1, free // each)
     if wanted is not None and wanted > fitting:
         raise InputError(
@@ -75,4 +73,5 @@ def _loaded_bytes(path: str) -> float:
         size = os.stat(path).st_size  # noqa: PTH116
     except OSError:
         return 0.0
-    return size * (_PER_COMPRESSED_BYTE if Path(path).suffix.lower() in _COMPRESSED else _PER_FILE_BYTE)
+    # Binary PLY of single floats has 12 bytes a point in the file, some 60 while it is thinned.
+    return size * (40 if Path(path).suffix.lower() in _COMPRESSED else 5)

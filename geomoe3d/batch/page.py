@@ -34,7 +34,6 @@ from geomoe3d.visual.templates import render
 from geomoe3d.visual.thumbnail import pair_thumbnail
 from geomoe3d.visual.upright import upright_axes
 
-_WIDTH, _HEIGHT = 280, 150
 _UNDRAWN = "no picture: one of the surest"
 
 
@@ -91,8 +90,6 @@ def render_batch_page(
         counts=", ".join(f"{count:,} {_word(status)}" for status, count in sorted(counts.items())),
         statuses=[(status, count, _word(status)) for status, count in sorted(counts.items())],
         cards=[_card(rows[k], outcomes[k], *pictures.get(k, ("", _UNDRAWN)), pages) for k in order],
-        width=_WIDTH,
-        height=_HEIGHT,
     )
 
 
@@ -125,7 +122,7 @@ def _picture(row: PairRow, outcome: Outcome) -> tuple[str, str]:
         return "", str(error)
     moved = transform_points(outcome.result.T_target_source, source)
     center = target.mean(axis=0)
-    data = pair_thumbnail(moved - center, target - center, axes, width=_WIDTH, height=_HEIGHT)
+    data = pair_thumbnail(moved - center, target - center, axes)
     return base64.b64encode(data).decode("ascii"), ""
 
 

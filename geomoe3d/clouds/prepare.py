@@ -22,8 +22,6 @@ from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, IntArray, PointCloud, PreparedCloud
 
 _MIN_POINTS = 3
-_E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
-_MOST_FLAGS = 2**26  # bytes spent on counting voxels by a flag each
 
 
 def prepare(
@@ -98,7 +96,8 @@ def round_size(size: float) -> float:
     """The nearest number of the series E24 (1, 1.1, 1.2, 1.3, 1.5, ... times a power of ten): steps so wide that
     clouds that differ by rounding get one voxel size."""
     power = 10.0 ** np.floor(np.log10(size))
-    series = np.array([*_E24, 100]) / 10
+    e24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
+    series = np.array([*e24, 100]) / 10
     nearest = series[np.abs(np.log(series * (power / size))).argmin()]
     return float(f"{nearest * power:.2g}")
 
@@ -314,7 +313,7 @@ def sorted_rows(keys: IntArray) -> IntArray:
 def _num_different(keys: IntArray) -> int:
     """How many different keys there are."""
     largest = int(keys.max())
-    if largest >= _MOST_FLAGS:
+    if largest >= 2**26:  # bytes spent on counting voxels by a flag each
         return len(np.unique(keys))
     seen = np.zeros(largest + 1, dtype=np.bool_)
     seen[keys] = True

@@ -16,8 +16,6 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 
-_FRAGMENTS = 4
-
 
 def draw_contact_sheet(scenes: list[Path], path: Path, *, force: bool = False) -> None:
     """Write a PNG with a row per scene: its plan and a few fragments as their cameras saw them.
@@ -33,7 +31,8 @@ def draw_contact_sheet(scenes: list[Path], path: Path, *, force: bool = False) -
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = 1 + _FRAGMENTS
+    most = 4  # fragments of a scene
+    columns = 1 + most
     figure = Figure(figsize=(3.2 * columns, 2.6 * len(scenes)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(scenes), columns, squeeze=False)
@@ -44,7 +43,7 @@ def draw_contact_sheet(scenes: list[Path], path: Path, *, force: bool = False) -
         _plan(row[0], folder.name, clouds, poses)
         for axis in row[1:]:
             axis.set_axis_off()
-        chosen = np.linspace(0, len(clouds) - 1, min(_FRAGMENTS, len(clouds))).round().astype(int)
+        chosen = np.linspace(0, len(clouds) - 1, min(most, len(clouds))).round().astype(int)
         for axis, k in zip(row[1:], chosen, strict=False):
             _view(axis, files[k].stem, clouds[k])
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=70), force=force)

@@ -24,7 +24,6 @@ from geomoe3d.types import FloatArray, IntArray
 
 NUM_COLORS = 8
 """Run colours of the style sheet; further runs repeat them with broken lines."""
-NUM_STAGE_COLORS = 16
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 _SOFT, _LINE, _PAPER = "#abcdf0", "#abcdf1", "#abcdf2"
 _VARIABLES = {_SOFT: "var(--soft)", _LINE: "var(--line)", _PAPER: "var(--paper)"}

@@ -12,12 +12,10 @@ import numpy as np
 
 from geomoe3d.types import BoolArray, FloatArray
 
-_ROWS = 2**15
-
 
 def in_cache(count: int) -> list[slice]:
     """Slices of so many rows that together are all of ``count``."""
-    return [slice(start, min(start + _ROWS, count)) for start in range(0, count, _ROWS)]
+    return [slice(start, min(start + 2**15, count)) for start in range(0, count, 2**15)]
 
 
 def bounds(points: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 SURFACES = "surfaces"
 """Name of the scorer without which nothing is said of an answer."""
 
-_LIFT = 4.0  # more than two similarities of unit features can differ by
-_AT_ONCE = 5  # hypotheses asked about together, for any number of threads
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -143,7 +140,8 @@ class Verifier:
         similarity = (self._features @ random_features.T).astype(np.float32)
         # Sorted, and each row lifted above the one before, so that one search counts what is more similar.
         self._num_random = similarity.shape[1]
-        self._lift = _LIFT * np.arange(len(similarity))
+        # Four is more than two similarities of unit features can differ by.
+        self._lift = 4.0 * np.arange(len(similarity))
         self._random_similarity = (np.sort(similarity, axis=1) + self._lift[:, None]).ravel()
         self._back = target.points[drawn_rows(target.points, edge, num_queries, seed + 2)]
         self._signed = source.viewpoint is not None and target.viewpoint is not None
@@ -161,7 +159,8 @@ class Verifier:
 
     def __call__(self, transforms: FloatArray) -> list[Evidence]:
         """What the clouds say of transforms (K, 4, 4), one each."""
-        lots = [transforms[k : k + _AT_ONCE] for k in range(0, len(transforms), _AT_ONCE)]
+        at_once = 5  # hypotheses asked about together, for any number of threads
+        lots = [transforms[k : k + at_once] for k in range(0, len(transforms), at_once)]
         return [evidence for lot in each(self._evidence, lots) for evidence in lot]
 
     def _evidence(self, motions: FloatArray) -> list[Evidence]:

@@ -25,7 +25,7 @@ from geomoe3d.errors import CheckpointError, OutputError
 from geomoe3d.features.learned import LEARNED, load_tensors
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.runtime.provenance import differences, in_words
-from geomoe3d.training.descriptor_network import WIDTH, DescriptorNetwork
+from geomoe3d.training.descriptor_network import DescriptorNetwork
 from geomoe3d.training.descriptor_pairs import ContrastBatch, ContrastPairs
 from geomoe3d.training.distributed import Process, choose_device
 
@@ -41,7 +41,7 @@ class DescriptorTrainConfig(Section):
     batch_size: int = Field(2, ge=1, description="pairs per step")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:1")
     init_from: str | None = Field(None, description="weights to start from (learned.safetensors)")
-    width: int = Field(WIDTH, ge=4, description="channels")
+    width: int = Field(64, ge=4, description="channels")
     learning_rate: float = Field(2e-3, gt=0, description="the largest of the schedule")
     weight_decay: float = Field(1e-3, ge=0)
     leave_out: int = Field(3, ge=0, description="scenes, the first by name, kept for validation")

@@ -14,8 +14,6 @@ from geomoe3d.features.learned import LEARNED
 from geomoe3d.features.pyramid import NUM_RELATIONS
 from geomoe3d.training.descriptor_views import LOOKS, View
 
-WIDTH = 64
-
 
 class Look(nn.Module):
     """A point looks at its neighbours: largest and mean of what each shows it join what it holds."""
@@ -40,7 +38,7 @@ class Look(nn.Module):
 class DescriptorNetwork(nn.Module):
     """FPFH on three grids to features of 32 numbers and length 1."""
 
-    def __init__(self, width: int = WIDTH) -> None:
+    def __init__(self, width: int = 64) -> None:
         super().__init__()
         fpfh = 33
         embed = [_mlp(inputs, width, width) for inputs in (fpfh, 2 * fpfh, 2 * fpfh)]

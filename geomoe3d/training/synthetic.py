@@ -17,15 +17,6 @@ from geomoe3d.config import Section
 from geomoe3d.training.pairs import TrainingPair
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
-_RANGES = {
-    "correspondences": 3,
-    "inlier_ratio": 0,
-    "noise": 0,
-    "spread": 1e-3,
-    "near_misses": 0,
-    "voxel_size": 1e-9,
-}
-
 
 class SyntheticConfig(Section):
     """Difficulty of the generated pairs; lengths in voxels unless said otherwise."""
@@ -52,7 +43,9 @@ class SyntheticConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> SyntheticConfig:
-        for name, least in _RANGES.items():
+        least_of = {"correspondences": 3, "spread": 1e-3, "voxel_size": 1e-9}
+        for name in ("correspondences", "inlier_ratio", "noise", "spread", "near_misses", "voxel_size"):
+            least = least_of.get(name, 0)
             low, high = getattr(self, name)
             if not least <= low <= high:
                 raise ValueError(f"{name} must be a range [low, high] with {least} <= low <= high")

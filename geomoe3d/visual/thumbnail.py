@@ -18,7 +18,7 @@ Pixels = NDArray[np.uint8]
 
 
 def pair_thumbnail(
-    source: FloatArray, target: FloatArray, axes: FloatArray, *, width: int, height: int
+    source: FloatArray, target: FloatArray, axes: FloatArray, *, width: int = 280, height: int = 150
 ) -> bytes:
     """A PNG of a source that lies on its target.
 

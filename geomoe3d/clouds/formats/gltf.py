@@ -30,7 +30,6 @@ _UNDERSTOOD = (  # extensions that change no position, and quantisation, which `
     *("EXT_texture_webp", "EXT_texture_avif", "KHR_xmp_json_ld", "KHR_node_visibility"),
 )
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
 @reader(".glb", ".gltf")
@@ -144,7 +143,8 @@ class _Document:
     def array(self, index: int) -> NDArray[Any]:
         """The values (count, width) of an accessor; normalised integers as the numbers they stand for."""
         accessor = self.content["accessors"][index]
-        kind, width = np.dtype("<" + _TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+        kind, width = np.dtype("<" + _TYPES[accessor["componentType"]]), widths[accessor["type"]]
         count = accessor["count"]
         if "bufferView" in accessor:
             values = self._view(accessor["bufferView"], accessor.get("byteOffset", 0), kind, count, width)

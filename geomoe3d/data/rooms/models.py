@@ -70,7 +70,6 @@ _WORDS: dict[str, tuple[str, ...]] = {
 }
 # Metres: most extent along the wall, into the room, upwards.
 _LARGEST = (3.5, 2.6, 2.6)
-_USUAL_HEIGHT = {"chair": 0.9, "table": 0.75, "desk": 0.75, "sofa": 0.8, "bed": 0.6, "wardrobe": 2.0}
 
 
 @dataclass(frozen=True)
@@ -209,7 +208,8 @@ def _read_piece(model: Model) -> Piece:
     elif 0.2 < extent.max() < 3.5 and (extent <= _LARGEST).all():
         scale = np.ones(3)
     else:
-        scale = np.full(3, _USUAL_HEIGHT.get(model.kind, 1.0) / max(extent[2], 1e-6))
+        usual = {"chair": 0.9, "table": 0.75, "desk": 0.75, "sofa": 0.8, "bed": 0.6, "wardrobe": 2.0}
+        scale = np.full(3, usual.get(model.kind, 1.0) / max(extent[2], 1e-6))
     size = extent * scale
     if (size > np.asarray(_LARGEST) + 1e-6).any():
         raise InputError(f"{size.round(2).tolist()} m are too large for furniture")

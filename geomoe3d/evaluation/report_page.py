@@ -114,6 +114,7 @@ def render_report(
         "galleries": galleries,
         "name_of": title,
         "text": report_words,
+        "counted": counted,
         "dumped": lambda identity: json.dumps(report_words.finite(identity), indent=1, sort_keys=True),
     }
     data = {str(card.number): card.clouds for card in cards if card.clouds is not None}

@@ -31,7 +31,7 @@ from geomoe3d.types import BoolArray, Correspondences, FilterOutput, FloatArray,
 
 @dataclass(frozen=True)
 class CorrespondenceResult:
-    """The motion that correspondences speak for. Whether it is right, only the clouds can say.
+    """The transform that correspondences speak for. Whether it is right, only the clouds can say.
 
     Attributes:
         T_target_source: (4, 4), p_target = R p_source + t, in the coordinates given; NaN where nothing was
@@ -39,7 +39,7 @@ class CorrespondenceResult:
         inliers: (N,) True where |R p + t - q| is below ``inlier_threshold``.
         inlier_threshold: in the unit given.
         weighed: what the filter said of the correspondences.
-        others: further motions (4, 4) that were considered, best first.
+        others: further transforms (4, 4) that were considered, best first.
         seconds: wall time of each stage and ``total``.
     """
 
@@ -52,7 +52,7 @@ class CorrespondenceResult:
 
     @property
     def found(self) -> bool:
-        """Whether there is a motion at all."""
+        """Whether there is a transform at all."""
         return bool(np.isfinite(self.T_target_source).all())
 
     @property
@@ -62,7 +62,7 @@ class CorrespondenceResult:
 
     @property
     def num_inliers(self) -> int:
-        """How many correspondences agree with the motion."""
+        """How many correspondences agree with the transform."""
         return int(self.inliers.sum())
 
 
@@ -192,7 +192,7 @@ def register_correspondences(
     voxel_size: float,
     config: RegistrationConfig | None = None,
 ) -> CorrespondenceResult:
-    """The rigid motion p_target = R p_source + t that anybody's correspondences speak for.
+    """The rigid transform p_target = R p_source + t that anybody's correspondences speak for.
 
     For features and matches of your own; with the clouds at hand, `geomoe3d.register` is right more often and
     says how sure it is. Many outliers are expected. A sensor is believed to have stood at zero where that can
@@ -205,7 +205,7 @@ def register_correspondences(
         config: complete configuration; None takes the defaults.
 
     Returns:
-        The motion, which correspondences agree with it, and their weights. Look at ``found`` first.
+        The transform, which correspondences agree with it, and their weights. Look at ``found`` first.
 
     Raises:
         InputError: no (N, 6) of finite numbers, or a voxel size that is not a positive length.

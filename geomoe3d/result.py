@@ -24,7 +24,7 @@ Status = Literal["ok", "low_confidence", "ambiguous", "failed"]
 
 @dataclass(frozen=True, eq=False, repr=False)  # arrays have no single truth value: compare what matters
 class RegistrationResult:
-    """The answer to "which rigid motion lays source on target?", with its own judgement.
+    """The answer to "which rigid transform lays source on target?", with its own judgement.
 
     Attributes:
         T_target_source: (4, 4) float64, p_target = R p_source + t, in the files' own coordinates. Present
@@ -49,7 +49,7 @@ class RegistrationResult:
         num_inliers: of these, how many agree with the transform.
         inlier_threshold: residual limit of an inlier, cloud units.
         voxel_size: edge of the voxel grid, cloud units.
-        alternative: the best clearly different motion, or None.
+        alternative: the best clearly different transform, or None.
         information_matrix: (6, 6), order [rotation (rad), translation], for the left perturbation
             p_target -> exp(rotation) (p_target - c) + c + translation in the target file's axes, with
             c = ``information_center``; over the point-to-plane residual variance of the matched points.

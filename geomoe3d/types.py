@@ -1,4 +1,4 @@
-"""The few nouns that travel through the package: clouds, correspondences, weights, motions, parts of a result.
+"""The few nouns that travel through the package: clouds, correspondences, weights, transforms, parts of a result.
 
 All of them are frozen; arrays inside are float64 unless said otherwise and are to be treated as read-only.
 Frames: a *file* coordinate is what the user's data holds; a *local* coordinate is the file coordinate minus
@@ -301,7 +301,7 @@ class CloudReport:
 
 @dataclass(frozen=True)
 class Alternative:
-    """The best hypothesis that is clearly another motion than the answer.
+    """The best hypothesis that is clearly another transform than the answer.
 
     Attributes:
         T_target_source: (4, 4) in file coordinates.

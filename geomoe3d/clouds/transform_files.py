@@ -1,4 +1,4 @@
-"""A rigid motion as a file, for geomoe3d and for other programs.
+"""A rigid transform as a file, for geomoe3d and for other programs.
 
 Stands beside `files`, below everything that registers. Numbers keep every bit: 17 significant digits in text
 (a quaternion rounds the rotation once more), float64 in NPY, shortest exact form in JSON. The texts
@@ -77,7 +77,7 @@ def save_transform(
     frames: tuple[str, str] = ("target", "source"),
     force: bool = False,
 ) -> None:
-    """Write a motion (4, 4) in any format of `transform_format` but a whole result.
+    """Write a transform (4, 4) in any format of `transform_format` but a whole result.
 
     Args:
         path: the file, with or without the name of a format.
@@ -157,7 +157,7 @@ def save_result(
 
 
 def has_transform(result: RegistrationResult) -> bool:
-    """Whether a result holds a motion at all, right or not."""
+    """Whether a result holds a transform at all, right or not."""
     return bool(np.isfinite(result.T_target_source).all())
 
 
@@ -175,14 +175,14 @@ def check_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...], more: 
 
 
 def load_transform(path: str | os.PathLike[str]) -> FloatArray:
-    """The motion (4, 4) of a file, told from its content whatever its name.
+    """The transform (4, 4) of a file, told from its content whatever its name.
 
     Anything that `save_result` writes; also a matrix of four or three rows of text, ROS 1's
     static_transform_publisher, geometry_msgs as YAML, and a PDAL pipeline with one filters.transformation.
 
     Raises:
         InputError: the file cannot be read, or holds a result without a transform.
-        FormatError: nothing that is understood as one motion.
+        FormatError: nothing that is understood as one transform.
     """
     path = Path(path)
     try:
@@ -207,7 +207,7 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
 
 
 def _of_npy(data: bytes) -> FloatArray:
-    """The motion of an NPY file; one whose header describes more than memory holds is refused too."""
+    """The transform of an NPY file; one whose header describes more than memory holds is refused too."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
         return of_matrix(np.asarray(array, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""A rigid motion as the text that other programs read, and whatever they write as a motion again.
+"""A rigid transform as the text that other programs read, and whatever they write as a transform again.
 
 Every text holds p_target = R p_source + t with 17 significant digits. ROS calls target the parent frame and
 source the child. What a text means is told from its content, so that any of them can be a first guess.
@@ -101,10 +101,10 @@ TEXTS: dict[str, Callable[[FloatArray, Sequence[str], tuple[str, str]], str]] = 
 
 
 def parse_transform(text: str) -> FloatArray:
-    """The motion (4, 4) of a text: any of `TEXTS`, a result as JSON, or a bare matrix.
+    """The transform (4, 4) of a text: any of `TEXTS`, a result as JSON, or a bare matrix.
 
     Raises:
-        FormatError: nothing that is understood, or more than one motion.
+        FormatError: nothing that is understood, or more than one transform.
         InputError: a result without a transform.
     """
     if text.lstrip()[:1] in ("{", "["):
@@ -247,5 +247,5 @@ def _motions(data: Any, depth: int = 0) -> Any:
 
 
 def describe_error(error: Exception) -> str:
-    """A reason for messages, of whatever a text that is no motion leads to."""
+    """A reason for messages, of whatever a text that is no transform leads to."""
     return f"{error}" if isinstance(error, (InputError, ValueError)) else f"{type(error).__name__}: {error}"

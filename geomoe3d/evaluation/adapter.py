@@ -15,7 +15,7 @@ Copy this into ``mine.py`` and evaluate ``mine.py:register`` (or ``package.modul
 On the correspondence tracks row i of one array belongs to row i of the other; on the track ``clouds`` they
 are the points of two scans, (n, 3) and (m, 3). Keywords named ``seed``, ``voxel_size`` and
 ``inlier_threshold`` are filled in where the function takes them. An exception or a result that is no rigid
-motion counts as a pair without an answer and is reported; only the file itself enters the identity of a
+transform counts as a pair without an answer and is reported; only the file itself enters the identity of a
 run, not what it imports. Cost: that of the function and one copy of its input.
 """
 
@@ -104,7 +104,7 @@ class AdaptedFunction:
 
 
 def _motion(result: Any, who: str) -> FloatArray | None:
-    """What a function returned as a rigid motion (4, 4); None and non-finite entries mean no answer.
+    """What a function returned as a rigid transform (4, 4); None and non-finite entries mean no answer.
 
     Raises:
         InputError: see `geomoe3d.geometry.se3.check_motion`; ``who`` begins the message.

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from geomoe3d.types import BoolArray, FloatArray
 
 INLIER_THRESHOLD = 0.10
-"""Metres; a correspondence with a smaller residual under the true motion is an inlier (benchmark rule)."""
+"""Metres; a correspondence with a smaller residual under the true transform is an inlier (benchmark rule)."""
 VOXEL_SIZE = 0.05
 """Metres; the grid of the benchmark's protocol."""
 
@@ -29,7 +29,7 @@ class EvaluationPair:
         scene: scene of the source.
         source: file of the source fragment.
         target: file of the target fragment.
-        T_target_source: (4, 4) true motion; None for unrelated scans, which have none.
+        T_target_source: (4, 4) true transform; None for unrelated scans, which have none.
         raw_T_target_source: (4, 4) the same as the published file has it, its rotation not projected onto
             SO(3); None where it does not differ.
         overlap: share of the source seen in the target, or None where not listed.
@@ -77,10 +77,10 @@ class Answer:
     """What a method says of one pair.
 
     Attributes:
-        T_target_source: (4, 4) p_target = R p_source + t, or None where the method gives no motion.
+        T_target_source: (4, 4) p_target = R p_source + t, or None where the method gives no transform.
         confidence: in [0, 1], or None for methods that do not say.
         status: ok, low_confidence, ambiguous, failed; None for methods that do not say.
-        hypotheses: further motions (4, 4) that the method considered, best first.
+        hypotheses: further transforms (4, 4) that the method considered, best first.
         correspondences: (N, 6) what the method weighed; None means those that it was given.
         weights: (N,) in [0, 1], or None.
         inliers: (N,) the method's own classification, or None where it makes none.
@@ -127,9 +127,9 @@ class Labels:
     """N correspondences of a pair, each judged in three ways.
 
     Attributes:
-        true: (N,) residual under the true motion below the threshold; all False for unrelated scans.
+        true: (N,) residual under the true transform below the threshold; all False for unrelated scans.
         kept: (N,) the method's own classification, or None.
-        verified: (N,) residual under the method's motion below the threshold; all False without a motion.
+        verified: (N,) residual under the method's transform below the threshold; all False without a transform.
     """
 
     true: BoolArray
@@ -215,7 +215,7 @@ class PairScore:
         rmse: the benchmark's error (facts of gt.info), metres; None for consecutive pairs.
         any_right: whether the answer or any hypothesis is right.
         precision, recall, f1: of the method's own classification; 0 where undefined, None without labels.
-        verified_precision, verified_recall, verified_f1: of the labels that the motion gives.
+        verified_precision, verified_recall, verified_f1: of the labels that the transform gives.
         confidence, status, seconds, stages, peak_memory, error: as in `Prediction`.
     """
 

@@ -80,7 +80,7 @@ class EdgeReport:
 
 @dataclass(frozen=True)
 class LoopReport:
-    """A loop of measured motions, see `geomoe3d.multiway.loops`; ``scans`` by name."""
+    """A loop of measured transforms, see `geomoe3d.multiway.loops`; ``scans`` by name."""
 
     scans: tuple[str, ...]
     shift: float

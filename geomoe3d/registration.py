@@ -171,7 +171,9 @@ class Registrar:
             clouds = clouds[1], clouds[0]
             guess = None if guess is None else inverse(guess)
             rows = None if rows is None else np.roll(rows, 3, axis=1)
-        line = Line(self.pipeline, config, clock, guess, rows, again, once=self._looks_once)
+        # Most doubtful pairs are of one unit; so the first look is all that another one gets.
+        once = None if again is None else self._rigid(second_look=False).register
+        line = Line(self.pipeline, config, clock, guess, rows, once, once=self._looks_once)
         found = line.explain((source, target), clouds, exchanged)
         found = found.exchanged() if exchanged else found
         return replace(found, source=loaded[0], target=loaded[1]).remembering(source, target)

@@ -270,7 +270,8 @@ class Search:
         agreement = float((cosine > expert().surfaces.least_cosine).sum() / len(moved))
         if self._view is None or agreement <= least:
             return agreement
-        around = np.array(level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach))
+        near = level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach)
+        around = np.array(near, dtype=np.int64)  # also where there is none
         around = around[np.argsort(self._order[around])[: expert().locating.asked_back]]
         if not len(around):
             return 0.0

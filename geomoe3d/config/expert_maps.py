@@ -32,7 +32,10 @@ class MapsExpert(Section):
         20, "-", (1, 10_000), "one of so many of the map's points, where that is more"
     )
     most_points: int = constant(
-        1_000_000, "points", (1000, 1_000_000_000), "of it at most: 40 s of processor time, and 220 MB"
+        1_000_000,
+        "points",
+        (1000, 1_000_000_000),
+        "of it, and of the other grid on which a scan is sought in the end, at most: 40 s of one core, 220 MB",
     )
     least_described: int = constant(
         2000,
@@ -69,7 +72,7 @@ class MapsExpert(Section):
         1000,
         "voxels",
         (10, 1_000_000),
-        "that a scan fills on the coarser grid on which it is sought in the end",
+        "that a scan fills on the other grid on which it is sought in the end",
         "a fragment with 3,200 of them was missed in its room, and found with 1,100",
     )
     known: float = constant(

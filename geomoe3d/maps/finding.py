@@ -25,8 +25,8 @@ from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
-Look = Literal["quick", "more", "coarser", "finer"]
-"""At the likeliest windows; at more, with more matches; that on a coarser grid; where it was found, on the scan's."""
+Look = Literal["quick", "more", "other", "finer"]
+"""At the likeliest windows; at more, with more matches; that on another grid; where it was found, on the scan's."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,14 @@ class Finder:
     Attributes:
         line: parts of the configuration.
         voxels: of the map.
-        level_for: gives the level for a scan whose own grid has an edge, and the coarsest one that serves it.
+        level_for: gives the level for a scan whose own grid has an edge, and the coarsest one that serves it; what is
+            made has so many points at most.
         name: of the map.
     """
 
     line: Pipeline
     voxels: VoxelSums
-    level_for: Callable[[float, float], Level]
+    level_for: Callable[[float, float, int], Level]
     name: str
 
     def __call__(
@@ -69,19 +70,18 @@ class Finder:
         view = find_viewpoints(cloud, cloud, rule)[0]
         local = [shift_frames(T, -cloud.origin, -self.voxels.origin) for T in guesses]
         own, coarsest = self._grids(cloud)
-        level = self.level_for(own, coarsest)
-        search = self._begun(cloud, view, level, clock)
+        search = self._begun(cloud, view, self.level_for(own, coarsest, expert().maps.asked_points), clock)
         known: list[FloatArray] = []
         times = max(1.0, count / expert().maps.candidates)
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
-            if look in ("coarser", "finer"):
-                coarser = look == "coarser"
-                other = self._coarser(search, cloud, own) if coarser else self._around(search, known, own)
-                if other is None:
+            if look in ("other", "finer"):
+                whole = look == "other"
+                level = self._other(search, cloud, own) if whole else self._around(search, known, own)
+                if level is None:
                     continue
-                search = self._begun(cloud, view, other, clock)
+                search = self._begun(cloud, view, level, clock)
             asked = [*local, *known]
             candidates = search.candidates(more=look != "quick", near=where, given=asked, times=times)
             known = [h.T_target_source for h in likely(candidates, count)]
@@ -128,14 +128,17 @@ class Finder:
         size = level.voxel_size
         return PreparedCloud(nothing, nothing, None, size, None, origin, self.name, count, scanned=False)
 
-    def _coarser(self, search: Search, cloud: PointCloud, own: float) -> Level | None:
-        """The map on a grid that shows less of a scan; None where that is no coarser than the search's."""
+    def _other(self, search: Search, cloud: PointCloud, own: float) -> Level | None:
+        """The map on a grid that shows less of a large scan, or more of a small one; None where the search's is near
+        it or a finer one takes too many points."""
         if self.line.config.voxel_size is not None:
             return None
+        was, finer = search.level.voxel_size, expert().maps.finer
         sought = max(own, choose_voxel_size(cloud, cloud, expert().maps.sought_voxels))
-        if search.level.voxel_size * expert().maps.finer >= sought:
+        if max(sought / was, was / sought) <= finer:
             return None
-        return self.level_for(sought, expert().maps.finer * sought)
+        level = self.level_for(sought, finer * sought, expert().maps.most_points)
+        return None if level is search.level else level
 
     def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
         """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
@@ -160,7 +163,7 @@ class Finder:
         yield "quick", None
         if self.line.config.second_look.grids or self.line.config.second_look.max_correspondences:
             yield "more", None
-            yield "coarser", None
+            yield "other", None
             yield "finer", None
 
     def _prior_notes(

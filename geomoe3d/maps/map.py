@@ -277,7 +277,7 @@ class Map:
     def _extent(self) -> float:
         return robust_extent(self._voxels.points)
 
-    def _level(self, size: float, coarsest: float) -> Level:
+    def _level(self, size: float, coarsest: float, most: int) -> Level:
         """The level for a scan that has this grid by itself, at most so coarse; made if there is none.
 
         What is made for a scan is no finer than a stated number of points allows, unless the grid is given.
@@ -285,7 +285,7 @@ class Map:
         finer = expert().maps.finer
         fitting = [x for x in self._levels if size / finer <= x.voxel_size <= coarsest]
         if not fitting and self.config.voxel_size is None:
-            size = max(size, self._voxels.edge_for(expert().maps.asked_points))
+            size = max(size, self._voxels.edge_for(most))
             fitting = [x for x in self._levels if size / finer <= x.voxel_size <= finer * size]
         if not fitting:
             return self._described(size)

@@ -148,7 +148,7 @@ class LocatingExpert(Section):
         0.75,
         "quick score",
         (0, 10),
-        "that no wrong transform in three rooms reached: only windows that may hold another such place are looked into",
+        "that no wrong transform reached in 24 queries: from it only windows of such places are looked into",
     )
     rival_votes: float = constant(
         0.8,

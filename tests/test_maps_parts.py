@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.features.base import with_features
@@ -15,6 +16,7 @@ from geomoe3d.features.pyramid import pyramid
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.maps.facing import both_sides, facing_alike
 from geomoe3d.maps.level import Compared
+from geomoe3d.maps.locate import Search
 from geomoe3d.maps.places import Query, Window
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.types import PreparedCloud
@@ -39,6 +41,28 @@ def test_of_a_small_scan_also_second_choices_propose():
     window = Window(np.ones(3), np.arange(120), 1.0)
     best = Query(Compared(points, normals, features), level).motions(window, 1)[0]
     np.testing.assert_allclose(best.T_target_source, T, atol=1e-3)
+
+
+def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
+    """A scan of two far ends: its middle lies where the map has nothing."""
+    ends = np.random.default_rng(0).uniform(0, 1, (200, 3)) * (1, 1, 0) + np.repeat(
+        [[0, 0, 0], [50, 0, 0]], 100, axis=0
+    )
+    up = np.tile([0.0, 0.0, 1.0], (200, 1))
+    level = SimpleNamespace(voxel_size=0.1, points=ends, normals=up, tree=cKDTree(ends))
+    scan = SimpleNamespace(points=ends, normals=up)
+    search = SimpleNamespace(
+        level=level,
+        scan=scan,
+        center=ends.mean(0),
+        reach=1.0,
+        _rows=np.arange(200),
+        _order=np.arange(200),
+        _view=object(),
+    )
+    assert Search._quick(search, np.eye(4)) == 0.0
+    search._view = None
+    assert Search._quick(search, np.eye(4)) == 1.0
 
 
 def test_voxels_are_those_of_the_whole_in_whatever_pieces():

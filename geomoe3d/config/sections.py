@@ -172,7 +172,7 @@ class SecondLookConfig(Section):
         16, ge=1, description="so many of the best distinct hypotheses are polished before the choice"
     )
     num_judged: int = Field(
-        8,
+        16,
         ge=1,
         description="so many of the best distinct hypotheses are shown to the network, if there is one",
     )

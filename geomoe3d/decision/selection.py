@@ -93,12 +93,12 @@ class Selection:
         """The best of all hypotheses so far, and how sure.
 
         Args:
-            num_refined: so many of the best distinct hypotheses are refined before the choice, and before costly
-                scorers are asked.
+            num_refined: so many of the best distinct hypotheses are refined before the choice; where there are
+                several, before costly scorers are asked. One alone refined would be judged beside others that are not.
             num_shown: so many that the clouds like best are shown to scorers that are selective.
         """
         selective = [name for name, scorer in self._scorers.items() if scorer.selective]
-        if num_refined > 1 or selective:
+        if num_refined > 1:
             self._refine_best(num_refined)
         if selective:
             self._clock("score")

@@ -35,6 +35,7 @@ from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
+from geomoe3d.scoring.surface_network import SURFACE_NETWORK
 from geomoe3d.types import Accuracy, FilterOutput, FloatArray, Hypothesis, PointCloud
 
 
@@ -245,7 +246,8 @@ class Line:
     def _is_described_again(self, judgement: Judgement) -> bool:
         """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little."""
         known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
-        least = self.config.second_look.checked_below if self.pipeline.second_scorers else 0.0
+        asked = list(self.pipeline.second_scorers) == [SURFACE_NETWORK]
+        least = self.config.second_look.checked_below if asked else 0.0
         doubtful = judgement.status != "ok" or judgement.confidence < least
         return known and doubtful and not self.once
 

@@ -247,25 +247,20 @@ def test_scorers_of_the_second_look_choose_and_leave_score_and_lead_alone(sample
     alone = decided({})
     assert alone.judgement.status == "ambiguous" and alone.margin is None
     for other, status in ((0.5, "ambiguous"), (1e-6, "low_confidence")):
-        chosen = decided({"contrary": Contrary(T, other)})
+        chosen = decided({SURFACE_NETWORK: Contrary(T, other)})
         assert motions_apart(T, chosen.T_target_source, np.zeros(3))[0] > 5
         assert set(chosen.answer.scores) == {"surfaces"}
         assert chosen.lead == pytest.approx(1 / alone.lead, rel=0.1)
         assert chosen.margin == pytest.approx(-np.log(other))
         assert chosen.judgement.status == status  # told apart only by one who prefers it by far
+    chosen = decided({"contrary": Contrary(T, 1e-6)})  # on whom the confidence was not fitted
+    assert motions_apart(T, chosen.T_target_source, np.zeros(3))[0] > 5
+    assert chosen.margin is None and chosen.judgement.status == "ambiguous"
 
 
-def test_an_answer_that_is_ok_by_little_is_checked(tmp_path):
-    """By the surface network where it is below the limit; one that everybody there denies is looked at again."""
+def test_an_answer_that_is_ok_by_little_is_checked(monkeypatch):
+    """By the surface network where it is below the limit; one that it denies is looked at again."""
     source, target, T = make_sample_pair(seed=0)
-    denies = tmp_path / "denies.py"
-    denies.write_text(
-        "import numpy as np\n"
-        "from geomoe3d.scoring.base import Belief, Scorer\n"
-        "class Denies(Scorer):\n"
-        "    def about(self, pair):\n"
-        "        return lambda transforms: [Belief(np.exp(-2.0 if k == 0 else 2.0)) for k in range(len(transforms))]\n"
-    )
 
     def answer(*settings):
         registrar = Registrar(load_config(None, ["voxel_size=0.08", *settings]))
@@ -275,6 +270,13 @@ def test_an_answer_that_is_ok_by_little_is_checked(tmp_path):
     assert never.status == always.status == "ok"
     assert "margin" not in never.evidence and always.evidence["margin"] > 1
     assert never.num_correspondences == always.num_correspondences  # the second descriptor proposed nothing
-    denied = answer("second_look.checked_below=1", f"second_look.scorers=[{denies}:Denies]")
+    own = answer("second_look.checked_below=1", "second_look.scorers=[surfaces]")
+    assert own.confidence == never.confidence and "margin" not in own.evidence
+
+    def denies(self, pair):
+        return lambda transforms: [Belief(np.exp(2.0 if k else -2.0)) for k in range(len(transforms))]
+
+    monkeypatch.setattr(SurfaceNetworkScorer, "about", denies)
+    denied = answer("second_look.checked_below=1")
     assert denied.num_correspondences > always.num_correspondences
     assert rotation_error_deg(denied.T_target_source, T) < 2

@@ -133,7 +133,7 @@ def _print(name: str, location: Location | None, as_json: bool, alone: bool) -> 
         click.echo(json.dumps({"scan": name, **json.loads(location.to_json(None))}))
         return
     if not alone:
-        place = " ".join(f"{value:.6g}" for value in location.T_map_scan[:3, 3])
+        place = " ".join(f"{value:.3f}" for value in location.T_map_scan[:3, 3])
         reason = f"; {location.result.reasons[0]}" if location.result.reasons else ""
         click.echo(
             f"{name}: {location.status} (confidence {location.result.confidence:.2f}) at {place}{reason}"
@@ -143,7 +143,7 @@ def _print(name: str, location: Location | None, as_json: bool, alone: bool) -> 
 
     click.echo(summary(location.result), color=False if os.environ.get("NO_COLOR") else None)
     for number, place_found in enumerate(location.places[1:], start=2):
-        at = " ".join(f"{value:.6g}" for value in place_found.T_map_scan[:3, 3])
+        at = " ".join(f"{value:.3f}" for value in place_found.T_map_scan[:3, 3])
         click.echo(f"place {number}: at {at}, {100 * place_found.relative_score:.0f} % of the score")
 
 

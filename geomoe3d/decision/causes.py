@@ -76,7 +76,7 @@ def mirrored_axes(
     if found.answer.score < known.mirrored_lead * score:
         return None
     return (
-        f"mirrored: with x of '{name}' the other way round the clouds fit (confidence "
-        f"{found.judgement.confidence:.2f}); a rigid transform cannot mirror, so bring both to right-handed axes "
-        "(often two axes are exchanged)"
+        f"mirrored: with x of '{name}' the other way round the clouds fit clearly better; if one of "
+        "them has left-handed axes (often two are exchanged), bring both to right-handed ones, since a rigid transform "
+        "cannot mirror"
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.scoring.base import PairScorer, Scorer
+from geomoe3d.scoring.surface_network import SURFACE_NETWORK
 from geomoe3d.types import FloatArray, Hypothesis
 
 
@@ -53,8 +54,11 @@ class Choosers:
     def margin(self, answer: Hypothesis, others: Iterable[Hypothesis | None]) -> float | None:
         """By how much they prefer an answer to the best that is clearly different, a logarithm; see `likings`.
 
-        An answer without any such is measured against a verdict that says nothing.
+        An answer without any such is measured against a verdict that says nothing. None where others than the surface
+        network choose: the confidence was fitted on its word alone.
         """
+        if list(self._scorers) != [SURFACE_NETWORK]:
+            return None
         different = [h for h in others if h is not None and self._differ(answer, h)]
         liked = self.likings([answer, *different])
         return (

@@ -97,21 +97,38 @@ def judge(
     unsure = confidence < config.min_confidence or (_hardly_told_apart(answer, rival) and not told_apart)
     close = (lead < 1 / config.ambiguity_ratio and not told_apart) or (alike and unsure)
     if close and alone >= limits.likely:
-        notes.append(
-            f"a clearly different transform does {min(100 / lead, 100):.0f} % as well; see the alternative, "
-            "the scans may show repeated or symmetric structure"
-        )
+        notes.append(_rival_note(lead, config.ambiguity_ratio, evidence, rival))
         return Judgement("ambiguous", tuple(notes), min(confidence, limits.most_doubted))
     few = _too_few(support, num_matches, information)
     if few is not None:
         return Judgement("low_confidence", (few, *notes), min(confidence, limits.most_doubted))
     if confidence < config.min_confidence:
         low = (
-            f"confidence {confidence:.2f} is below {config.min_confidence:.2f}: the scans may not overlap, "
+            f"confidence {_rounded_down(confidence)} is below {config.min_confidence:.2f}: the scans may not overlap, "
             "or share too little distinctive surface"
         )
         return Judgement("low_confidence", (*notes, low), confidence, low)
     return Judgement("ok", tuple(notes), confidence)
+
+
+def _rounded_down(confidence: float) -> str:
+    """Two digits that never reach a limit which the number is below."""
+    return f"{np.floor(100 * confidence) / 100:.2f}"
+
+
+def _rival_note(lead: float, ratio: float, evidence: Evidence, rival: Hypothesis | None) -> str:
+    """A sentence about a rival that is as good, by the score or by the surfaces alone."""
+    if lead < 1:
+        said = (
+            f"a clearly different transform has the higher score ({100 / lead:.0f} %), and only the surface network "
+            "prefers the answer"
+        )
+    elif lead < 1 / ratio or rival is None:
+        said = f"a clearly different transform does {100 / lead:.0f} % as well"
+    else:
+        share = 100 * evidence_of(rival).surface_score / evidence.surface_score
+        said = f"by the surfaces alone a clearly different transform does {share:.0f} % as well"
+    return f"{said}; see the alternative, the scans may show repeated or symmetric structure"
 
 
 def _too_few(support: float, num_matches: int | None, information: Information) -> str | None:

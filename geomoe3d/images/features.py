@@ -75,7 +75,10 @@ def read_grey(path: str | Path) -> NDArray[np.uint8]:
         str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     )
     if image is None:
-        raise InputError(f"'{path}' cannot be read as an image; convert it to PNG or JPEG")
+        raise InputError(
+            f"'{path}' cannot be read as an image: it is damaged, or of a kind that OpenCV "
+            "does not know; give a whole PNG or JPEG"
+        )
     _check_whole(Path(path))
     return image
 

@@ -219,7 +219,7 @@ class Line:
         with single_blas_thread():
             selection, looks = select(pair, proposed), [pair]
             decision = selection.decide()
-            if given is None and sides == "sensor" and self._is_described_again(decision.judgement):
+            if given is None and sides == "sensor" and self._is_described_again(pair, decision):
                 described = line.described_again(pair.clouds, clock)
                 if decision.judgement.status == "ok":
                     seen = line.pair(described, pair.matched, places)
@@ -243,12 +243,16 @@ class Line:
                 decision = selection.decide(look.num_refined, look.num_judged)
         return Look(pair, weighed, decision)
 
-    def _is_described_again(self, judgement: Judgement) -> bool:
-        """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little."""
+    def _is_described_again(self, pair: Pair, decision: Decision) -> bool:
+        """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little and has a rival or
+        few matches that agree."""
         known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
         asked = list(self.pipeline.second_scorers) == [SURFACE_NETWORK]
         least = self.config.second_look.checked_below if asked else 0.0
-        doubtful = judgement.status != "ok" or judgement.confidence < least
+        doubtful = decision.judgement.status != "ok"
+        if decision.judgement.confidence < least:
+            limits, agreeing = expert().confidence, decision.residuals(pair.matched) < pair.inlier_threshold
+            doubtful |= decision.lead < limits.most_lead or int(agreeing.sum()) < limits.plain_matches
         return known and doubtful and not self.once
 
     def _is_doubtful(self, judgement: Judgement) -> bool:

@@ -266,17 +266,20 @@ def test_an_answer_that_is_ok_by_little_is_checked(monkeypatch):
         registrar = Registrar(load_config(None, ["voxel_size=0.08", *settings]))
         return registrar.register(source.file_points, target.file_points)
 
-    never, always = (answer(f"second_look.checked_below={least}") for least in (0, 1))
+    doubting = "expert.confidence.plain_matches=1000000"
+    never, always = (answer(f"second_look.checked_below={least}", doubting) for least in (0, 1))
     assert never.status == always.status == "ok"
     assert "margin" not in never.evidence and always.evidence["margin"] > 1
     assert never.num_correspondences == always.num_correspondences  # the second descriptor proposed nothing
-    own = answer("second_look.checked_below=1", "second_look.scorers=[surfaces]")
+    plain = answer("second_look.checked_below=1")  # no rival, and many matches agree
+    assert "margin" not in plain.evidence
+    own = answer("second_look.checked_below=1", doubting, "second_look.scorers=[surfaces]")
     assert own.confidence == never.confidence and "margin" not in own.evidence
 
     def denies(self, pair):
         return lambda transforms: [Belief(np.exp(2.0 if k else -2.0)) for k in range(len(transforms))]
 
     monkeypatch.setattr(SurfaceNetworkScorer, "about", denies)
-    denied = answer("second_look.checked_below=1")
+    denied = answer("second_look.checked_below=1", doubting)
     assert denied.num_correspondences > always.num_correspondences
     assert rotation_error_deg(denied.T_target_source, T) < 2

@@ -113,6 +113,13 @@ class ConfidenceExpert(Section):
         "margin from which transforms that clouds and network like alike are told apart",
         "at most 0.4 between two places that are both right",
     )
+    plain_matches: int = constant(
+        15,
+        "matches",
+        (0, 1_000_000),
+        "that agree with an answer which is ok by little and has no rival: then it is not checked",
+        "of 266 such answers of real pairs 178 have as many and no rival, one of them far off",
+    )
     most_sliding: float = constant(0.3, "probability", (0, 1), "most confidence where the source can slide")
     most_doubted: float = constant(
         0.79,

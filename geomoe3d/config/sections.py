@@ -140,8 +140,8 @@ class SecondLookConfig(Section):
         0.985,
         ge=0,
         le=1,
-        description="an ok answer of less confidence is shown to the surface network too; 0, or without it or "
-        "the descriptor learned in the second look: none is",
+        description="an ok answer of less confidence that has a rival, or that few matches agree with, is shown to the "
+        "surface network too; 0, or without it or the descriptor learned in the second look: none is",
     )
     num_checked: int = Field(
         3,

@@ -22,6 +22,7 @@ from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.causes import Register, differing_units, is_sure, mirrored_axes
+from geomoe3d.decision.choosers import have_margin
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.parallel import made_parallel
@@ -35,7 +36,6 @@ from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.network import NETWORK, opinion_of
-from geomoe3d.scoring.surface_network import SURFACE_NETWORK
 from geomoe3d.types import Accuracy, FilterOutput, FloatArray, Hypothesis, PointCloud
 
 
@@ -247,7 +247,7 @@ class Line:
         """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little and has a rival or
         few matches that agree."""
         known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
-        asked = list(self.pipeline.second_scorers) == [SURFACE_NETWORK]
+        asked = have_margin(self.pipeline.second_scorers)
         least = self.config.second_look.checked_below if asked else 0.0
         doubtful = decision.judgement.status != "ok"
         if decision.judgement.confidence < least:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
+from scored_pairs import scored, undefined
 
 from geomoe3d.evaluation.calibration import (
     acceptance,
@@ -19,41 +20,8 @@ from geomoe3d.evaluation.calibration import (
     risk_coverage,
 )
 from geomoe3d.evaluation.intervals import Quantity, measure_all, wilson
-from geomoe3d.evaluation.records import PairScore
 
 NAN = math.nan
-
-
-def scored(
-    confidence: float | None, right: bool, scene: str = "room", status: str | None = None
-) -> PairScore:
-    return PairScore(
-        pair="p",
-        scene=scene,
-        overlap=None,
-        inlier_ratio=None,
-        rotation_error_deg=1.0,
-        translation_error=0.1,
-        right=right,
-        right_20=right,
-        rmse=None,
-        any_right=right,
-        precision=None,
-        recall=None,
-        f1=None,
-        verified_precision=None,
-        verified_recall=None,
-        verified_f1=None,
-        confidence=confidence,
-        status=status,
-        seconds=0.1,
-        stages={},
-        peak_memory=None,
-    )
-
-
-def undefined(interval: tuple[float, float]) -> bool:
-    return math.isnan(interval[0]) and math.isnan(interval[1])
 
 
 @settings(max_examples=80, deadline=None)

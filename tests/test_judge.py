@@ -216,16 +216,19 @@ def test_the_margin_of_a_second_look_makes_surer_up_to_a_bound() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lead", "surface", "words"),
+    ("lead", "surface", "margin", "words"),
     [
-        (0.5, 1.0, r"has the higher score \(200 %\), and only the surface network prefers the answer"),
-        (1.1, 1.0, "different transform does 91 % as well"),
-        (3.0, 0.9, "by the surfaces alone a clearly different transform does 90 % as well"),
+        (0.5, 1.0, None, r"has the higher score \(200 %\); see"),  # nobody else was asked
+        (0.5, 1.0, 1.0, r"has the higher score \(200 %\), and only the surface network prefers the answer"),
+        (1.1, 1.0, None, "different transform does 91 % as well"),
+        (3.0, 0.9, None, "by the surfaces alone a clearly different transform does 90 % as well"),
     ],
 )
-def test_a_rival_is_told_of_by_what_makes_it_one(lead: float, surface: float, words: str) -> None:
+def test_a_rival_is_told_of_by_what_makes_it_one(
+    lead: float, surface: float, margin: float | None, words: str
+) -> None:
     mine, rival = (scored(evidence(5.0 * share, overlap=0.5), 3.0) for share in (1.0, surface))
-    judged = confidence.judge(mine, rival, lead, 0.3, FIRM, DecisionConfig())
+    judged = confidence.judge(mine, rival, lead, 0.3, FIRM, DecisionConfig(), margin=margin)
     assert judged.status == "ambiguous"
     assert any(re.search(words, reason) for reason in judged.reasons)
 

@@ -230,6 +230,12 @@ def with_its_copy_beside(cloud: PreparedCloud) -> PreparedCloud:
     )
 
 
+class Fitted(Contrary):
+    """As if the confidence had been fitted on its word."""
+
+    has_margin = True
+
+
 def test_scorers_of_the_second_look_choose_and_leave_score_and_lead_alone(sample):
     pair, T = sample
     line = Pipeline(resolved(load_config(None, ["scoring.scorers=[surfaces]"])))
@@ -247,7 +253,7 @@ def test_scorers_of_the_second_look_choose_and_leave_score_and_lead_alone(sample
     alone = decided({})
     assert alone.judgement.status == "ambiguous" and alone.margin is None
     for other, status in ((0.5, "ambiguous"), (1e-6, "low_confidence")):
-        chosen = decided({SURFACE_NETWORK: Contrary(T, other)})
+        chosen = decided({"contrary": Fitted(T, other)})
         assert motions_apart(T, chosen.T_target_source, np.zeros(3))[0] > 5
         assert set(chosen.answer.scores) == {"surfaces"}
         assert chosen.lead == pytest.approx(1 / alone.lead, rel=0.1)

@@ -11,8 +11,12 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.scoring.base import PairScorer, Scorer
-from geomoe3d.scoring.surface_network import SURFACE_NETWORK
 from geomoe3d.types import FloatArray, Hypothesis
+
+
+def have_margin(scorers: Mapping[str, Scorer]) -> bool:
+    """Whether there are any, and the confidence was fitted on the word of all of them."""
+    return bool(scorers) and all(scorer.has_margin for scorer in scorers.values())
 
 
 class Choosers:
@@ -57,7 +61,7 @@ class Choosers:
         An answer without any such is measured against a verdict that says nothing. None where others than the surface
         network choose: the confidence was fitted on its word alone.
         """
-        if list(self._scorers) != [SURFACE_NETWORK]:
+        if not have_margin(self._scorers):
             return None
         different = [h for h in others if h is not None and self._differ(answer, h)]
         liked = self.likings([answer, *different])

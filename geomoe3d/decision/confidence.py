@@ -97,7 +97,7 @@ def judge(
     unsure = confidence < config.min_confidence or (_hardly_told_apart(answer, rival) and not told_apart)
     close = (lead < 1 / config.ambiguity_ratio and not told_apart) or (alike and unsure)
     if close and alone >= limits.likely:
-        notes.append(_rival_note(lead, config.ambiguity_ratio, evidence, rival))
+        notes.append(_rival_note(lead, config.ambiguity_ratio, evidence, rival, margin))
         return Judgement("ambiguous", tuple(notes), min(confidence, limits.most_doubted))
     few = _too_few(support, num_matches, information)
     if few is not None:
@@ -116,13 +116,14 @@ def _rounded_down(confidence: float) -> str:
     return f"{np.floor(100 * confidence) / 100:.2f}"
 
 
-def _rival_note(lead: float, ratio: float, evidence: Evidence, rival: Hypothesis | None) -> str:
+def _rival_note(
+    lead: float, ratio: float, evidence: Evidence, rival: Hypothesis | None, margin: float | None
+) -> str:
     """A sentence about a rival that is as good, by the score or by the surfaces alone."""
     if lead < 1:
-        said = (
-            f"a clearly different transform has the higher score ({100 / lead:.0f} %), and only the surface network "
-            "prefers the answer"
-        )
+        said = f"a clearly different transform has the higher score ({100 / lead:.0f} %)"
+        if margin is not None and margin > 0:
+            said += ", and only the surface network prefers the answer"
     elif lead < 1 / ratio or rival is None:
         said = f"a clearly different transform does {100 / lead:.0f} % as well"
     else:

@@ -37,6 +37,8 @@ class Scorer(Part):
     """
 
     selective: ClassVar[bool] = False
+    has_margin: ClassVar[bool] = False
+    """Whether the confidence was fitted on how clearly it prefers an answer, as one of those who help to choose."""
 
     @abstractmethod
     def about(self, pair: Pair) -> PairScorer:

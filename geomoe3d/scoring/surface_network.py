@@ -58,6 +58,8 @@ class SurfaceNetworkScorer(Scorer):
         CheckpointError: the file is missing, damaged, or holds another network.
     """
 
+    has_margin = True
+
     def __init__(self, weights: str | None = None) -> None:
         self._path = WEIGHTS if weights is None else Path(weights)
 

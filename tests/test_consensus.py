@@ -9,7 +9,7 @@ import pytest
 from estimator_problems import CONSENSUS, THRESHOLD, assert_motion, problem, random_motion, room_points
 from scipy.spatial.distance import cdist
 
-from geomoe3d.estimators import consensus
+from geomoe3d.estimators import compatibility, fitting
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.geometry.rigid_fit import products
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
@@ -115,8 +115,8 @@ def test_twelve_thousand_correspondences_stay_within_bounds(monkeypatch: pytest.
     rows, T, true = problem(14, count=12_000, inliers=0.02, noise=0.005)
     weights = np.where(true, 1.0, 0.5)
     sizes = []
-    plain = consensus.distances
-    monkeypatch.setattr(consensus, "distances", lambda p, q: (sizes.append(len(q)), plain(p, q))[1])
+    plain = compatibility.distances
+    monkeypatch.setattr(compatibility, "distances", lambda p, q: (sizes.append(len(q)), plain(p, q))[1])
     tracemalloc.start()
     found = ConsensusEstimator(max_dense=1000, num_seeds=100)(rows, weights, inlier_threshold=THRESHOLD)
     peak = tracemalloc.get_traced_memory()[1]
@@ -138,10 +138,10 @@ def test_default_bound_of_all_pairs() -> None:
 def test_distances_and_compatibility_equal_their_definitions() -> None:
     rng = np.random.default_rng(80)
     p, q = rng.normal(size=(2, 60, 3)).astype(np.float32) * 20
-    np.testing.assert_allclose(consensus.distances(p, p), cdist(p, p), atol=0.05)
+    np.testing.assert_allclose(compatibility.distances(p, p), cdist(p, p), atol=0.05)
     q[:30] = p[:30]
     expected = np.abs(cdist(p, p) - cdist(q, q))
-    apart, compatible = consensus.compatibility(p, q)
+    apart, compatible = compatibility.compatibility(p, q)
     np.testing.assert_allclose(apart, cdist(p, p), atol=0.05)
     sure = np.abs(expected - 1) > 1e-3
     off_diagonal = ~np.eye(60, dtype=bool)
@@ -153,7 +153,7 @@ def test_distances_and_compatibility_equal_their_definitions() -> None:
 def test_bundles_share_their_vote() -> None:
     target = np.array([[1.0, 2, 3], [1, 2, 3], [0, 0, 0], [1, 2, 3], [1, 2, 3], [5, 5, 5], [-0.0, 0, 0]])
     expected = 1 / np.sqrt([4, 4, 2, 4, 4, 1, 2])
-    np.testing.assert_allclose(consensus.bundle_weights(target), expected, rtol=1e-6)
+    np.testing.assert_allclose(compatibility.bundle_weights(target), expected, rtol=1e-6)
 
 
 def test_local_sets_are_the_best_by_second_order_compatibility() -> None:
@@ -164,7 +164,7 @@ def test_local_sets_are_the_best_by_second_order_compatibility() -> None:
     vote = rng.uniform(0.1, 1, n).astype(np.float32)
     seeds = np.array([3, 17, 39])
     witnesses = np.arange(0, n, 2)
-    members, weights = consensus.local_sets(compatible, seeds, vote, size, witnesses)
+    members, weights = compatibility.local_sets(compatible, seeds, vote, size, witnesses)
     assert members.shape == weights.shape == (3, size + 1)
     for row, seed in enumerate(seeds):
         S = [
@@ -185,14 +185,14 @@ def test_seeds_are_the_best_supported_and_spread() -> None:
     points[:10] = points[0] + 0.01 * rng.normal(size=(10, 3))  # one bundle with the largest supports
     support = np.r_[np.linspace(50, 41, 10), np.linspace(40, 26, 40)].astype(np.float32)
     ranks = rng.permutation(50).astype(np.uint64)
-    strength = consensus.strengths(support, cdist(points, points).astype(np.float32))
-    seeds = consensus.choose_seeds(strength, ranks, 30)
+    strength = compatibility.strengths(support, cdist(points, points).astype(np.float32))
+    seeds = compatibility.choose_seeds(strength, ranks, 30)
     # 0 leads; all others of the bundle count half, less than any of the scattered ones. Three quarters of
     # the seeds are the strongest in that order, the others those of the rest that have the lowest ranks.
     order = [0, *range(10, 50), *range(1, 10)]
     assert list(seeds[:23]) == order[:23]
     assert list(seeds[23:]) == sorted(order[23:], key=lambda k: ranks[k])[:7]
-    assert list(consensus.choose_seeds(strength, ranks, 50)) == list(range(50))
+    assert list(compatibility.choose_seeds(strength, ranks, 50)) == list(range(50))
 
 
 def test_score_is_the_documented_sum() -> None:
@@ -205,16 +205,16 @@ def test_score_is_the_documented_sum() -> None:
         (vote * np.exp(-((transform_points(x, source) - target) ** 2).sum(1) / (2 * 0.75**2))).sum()
         for x in T
     ]
-    np.testing.assert_allclose(consensus.score(R, t, products(source, target), vote), expected, rtol=1e-4)
+    np.testing.assert_allclose(fitting.score(R, t, products(source, target), vote), expected, rtol=1e-4)
 
 
 def test_refit_leaves_a_motion_with_two_inliers() -> None:
     source = np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5]], dtype=np.float32)
     target = source + np.array([[0.1, 0, 0], [0.1, 0, 0], [30, 0, 0], [0, 30, 0]])
     R, t = np.eye(3, dtype=np.float32)[None], np.zeros((1, 3), dtype=np.float32)
-    R_new, t_new = consensus.refit(R, t, products(source, target), np.ones(4, dtype=np.float32))
+    R_new, t_new = fitting.refit(R, t, products(source, target), np.ones(4, dtype=np.float32))
     np.testing.assert_array_equal(R_new, R)
     np.testing.assert_array_equal(t_new, t)
     target[2] = source[2] + [0.1, 0, 0]
-    _, t_new = consensus.refit(R, t, products(source, target), np.ones(4, dtype=np.float32))
+    _, t_new = fitting.refit(R, t, products(source, target), np.ones(4, dtype=np.float32))
     np.testing.assert_allclose(t_new, [[0.1, 0, 0]], atol=1e-5)

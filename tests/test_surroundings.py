@@ -14,7 +14,9 @@ from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import EstimatorConfig, MatchingConfig
 from geomoe3d.errors import InputError
 from geomoe3d.estimators.base import Estimator
-from geomoe3d.estimators.consensus import ConsensusEstimator, compatibility, score
+from geomoe3d.estimators.compatibility import compatibility
+from geomoe3d.estimators.consensus import ConsensusEstimator
+from geomoe3d.estimators.fitting import score
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import products

@@ -27,25 +27,25 @@ from numpy.typing import ArrayLike
 
 from geomoe3d.config import EstimatorConfig
 from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
+from geomoe3d.estimators.compatibility import (
+    BLOCK,
+    PAIR_BLOCK,
+    blocks,
+    bundle_weights,
+    choose_seeds,
+    compatibility,
+    local_sets,
+    strengths,
+)
+from geomoe3d.estimators.fitting import about_origin, finished, refit, score
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.draws import Ranks, cell_ranks
-from geomoe3d.geometry.rigid_fit import (
-    fit_rigid,
-    fit_rigid_shared,
-    products,
-    spread_shared,
-    squared_residuals_shared,
-)
-from geomoe3d.geometry.se3 import make_transform
+from geomoe3d.geometry.rigid_fit import fit_rigid, products
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import BoolArray, Float32Array, FloatArray, Hypothesis, IntArray
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-_BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
-_PAIR_BLOCK = 125  # the same where several such blocks are worked on
-_SCORED_AT_ONCE = 64_000
 
 
 @estimator("consensus")
@@ -145,12 +145,12 @@ class ConsensusEstimator(Estimator):
             R, t = self._refitted(R, t, known, vote, refits)
             scores = score(R, t, known, vote, surroundings)
             if surroundings is not None:
-                scores = scores * surroundings.plausibility(R, _shift(R, t, centre / inlier_threshold))
+                scores = scores * surroundings.plausibility(R, about_origin(R, t, centre / inlier_threshold))
         best = self._distinct_rows(R, t, scores, some)
-        finished = _finished(R[best], t[best], scores[best], unit, known, centre, vote, inlier_threshold)
-        if finished and self._is_settled(R[best], t[best], scores[best], len(rows)):
-            finished[0].settled = finished[0].proposal_score == float(scores[best[0]])
-        return finished[: self.num_hypotheses]
+        found = finished(R[best], t[best], scores[best], unit, known, centre, vote, inlier_threshold)
+        if found and self._is_settled(R[best], t[best], scores[best], len(rows)):
+            found[0].settled = found[0].proposal_score == float(scores[best[0]])
+        return found[: self.num_hypotheses]
 
     def _is_settled(self, R: FloatArray, t: FloatArray, scores: FloatArray, count: int) -> bool:
         """Whether one of the motions (K, 3, 3), (K, 3) has all that it takes; see `settled_share`."""
@@ -191,8 +191,8 @@ class ConsensusEstimator(Estimator):
             return R, t, score(R, t, known, vote, surroundings)
 
         # The first block holds strong seeds and drawn ones: these propose what a second, weaker motion has.
-        half = _BLOCK // 2
-        first, *others = _blocks(np.concatenate([seeds[:half], seeds[half:][::-1]]))
+        half = BLOCK // 2
+        first, *others = blocks(np.concatenate([seeds[:half], seeds[half:][::-1]]))
         proposed = [of(first)]
         settled = self._seems_settled(*proposed[0], known, vote, surroundings)
         if not settled:
@@ -241,12 +241,12 @@ class ConsensusEstimator(Estimator):
         def close(some: IntArray, others: IntArray | list[int]) -> BoolArray:
             # The centroid is at zero in these coordinates, so t is where it goes.
             away = squares[some, None] + squares[others] - 2 * (t[some] @ t[others].T)
-            found: BoolArray = away < self.distinct_thresholds**2
-            found &= turns[some] @ turns[others].T > least_trace
-            return found
+            near: BoolArray = away < self.distinct_thresholds**2
+            near &= turns[some] @ turns[others].T > least_trace
+            return near
 
         keep: list[int] = []
-        for some in _blocks(np.argsort(-scores, kind="stable"), _PAIR_BLOCK):
+        for some in blocks(np.argsort(-scores, kind="stable"), PAIR_BLOCK):
             free = some[~close(some, keep).any(1)]
             among, left = close(free, free), np.ones(len(free), dtype=np.bool_)
             for row in range(len(free)):
@@ -256,182 +256,3 @@ class ConsensusEstimator(Estimator):
                     if len(keep) == limit:
                         return keep
         return keep
-
-
-def _finished(
-    R: FloatArray,
-    t: FloatArray,
-    scores: FloatArray,
-    unit: FloatArray,
-    known: FloatArray,
-    centre: FloatArray,
-    vote: Float32Array,
-    inlier_threshold: float,
-) -> list[Hypothesis]:
-    """A last fit on the inliers of each motion, in order; those without enough are left out.
-
-    R (K, 3, 3), t (K, 3), unit (N, 6) in inlier thresholds about ``centre``; known (N, 17) the products of unit.
-    """
-    r2 = squared_residuals_shared(R, t, known)
-    weights = vote * (r2 < 1) / (1 + r2)
-    # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
-    thinnest = np.minimum(spread_shared(unit[:, :3], weights), spread_shared(unit[:, 3:], weights))
-    firm = ((weights > 0).sum(1) >= 3) & (thinnest >= 0.05)
-    if not firm.any():
-        return []
-    R, t = fit_rigid_shared(known, weights[firm])
-    counts = (squared_residuals_shared(R, t, known) < 1).sum(1)
-    shift = _shift(R, t * inlier_threshold, centre)
-    return [
-        Hypothesis(make_transform(*motion), float(score_value), int(count))
-        for *motion, score_value, count in zip(R, shift, scores[firm], counts, strict=True)
-    ]
-
-
-def _shift(R: FloatArray, t: FloatArray, centre: FloatArray) -> FloatArray:
-    """t (K, 3) of motions about ``centre`` (6,), the means of both halves, as they are about the origin."""
-    found: FloatArray = t + centre[3:] - np.einsum("kij,j->ki", R, centre[:3])
-    return found
-
-
-def bundle_weights(target: FloatArray) -> Float32Array:
-    """1 / sqrt(number of correspondences that share the target point), (N,) float32."""
-    _, inverse, counts = np.unique(target, axis=0, return_inverse=True, return_counts=True)
-    weights: Float32Array = (1.0 / np.sqrt(counts[inverse.ravel()])).astype(np.float32)
-    return weights
-
-
-def distances(a: Float32Array, b: Float32Array) -> Float32Array:
-    """(N, M) Euclidean distances of points (N, 3) and (M, 3), near zero, through one matrix product."""
-    a2, b2 = (a * a).sum(1, keepdims=True), (b * b).sum(1, keepdims=True)
-    # [-2a, |a|^2, 1] . [b, 1, |b|^2] = |a - b|^2 without a further pass over N x M numbers.
-    left, right = np.hstack([-2 * a, a2, np.ones_like(a2)]), np.hstack([b, np.ones_like(b2), b2])
-    found: Float32Array = left @ right.T
-    np.maximum(found, 0, out=found)
-    np.sqrt(found, out=found)
-    return found
-
-
-def compatibility(
-    source: Float32Array,
-    target: Float32Array,
-    tolerance: float = 1.0,
-    surroundings: Surroundings | None = None,
-) -> tuple[Float32Array, Float32Array]:
-    """Distances of the source points (N, N), and how compatible two correspondences are, in [0, 1].
-
-    0 where they do not preserve length; else 1, or how well their planes agree where those are known.
-    Points (N, 3) in inlier thresholds, as the tolerance; the diagonal of the second (N, N) is zero.
-    """
-    apart = np.empty((len(source), len(source)), dtype=np.float32)
-    compatible = np.empty_like(apart)
-
-    agree = None if surroundings is None else surroundings.of_pairs(source, target)
-
-    def fill(some: IntArray) -> None:
-        # Both are symmetric: from the diagonal on, and the same below it.
-        rows, rest = slice(some[0], some[-1] + 1), slice(some[0], None)
-        near = distances(source[rows], source[rest])
-        gap = distances(target[rows], target[rest])
-        gap -= near
-        found = np.less(np.abs(gap, out=gap), tolerance, out=gap, casting="unsafe")
-        if agree is not None:
-            found *= agree(rows, near)
-        for whole, part in ((apart, near), (compatible, found)):
-            whole[rows, rest] = part
-            whole[rest, rows] = part.T
-
-    each(fill, _blocks(np.arange(len(source)), _PAIR_BLOCK))
-    np.fill_diagonal(compatible, 0)
-    return apart, compatible
-
-
-def _blocks(rows: IntArray, size: int = _BLOCK) -> list[IntArray]:
-    """Rows in parts of at most ``size``, the same ones for any number of threads."""
-    return [rows[start : start + size] for start in range(0, len(rows), size)]
-
-
-def strengths(support: Float32Array, source_distance: Float32Array) -> Float32Array:
-    """Support (N,), half of it where a neighbour within the threshold has more, so that a dense bundle of wrong matches
-    does not take all places."""
-    beaten = ((source_distance < 1.0) & (support[None, :] > support[:, None])).any(1)
-    return np.where(beaten, np.float32(0.5) * support, support)
-
-
-def choose_seeds(strength: Float32Array, ranks: Ranks, limit: int) -> IntArray:
-    """Rows with the largest strength, and a quarter of the limit drawn from all others, those of the lowest ranks: they
-    give a second, weaker motion its proposals."""
-    if len(strength) <= limit:
-        return np.arange(len(strength))
-    order = np.argsort(-strength, kind="stable")
-    strongest = limit - limit // 4
-    rest = order[strongest:]
-    drawn = rest[np.argsort(ranks[rest], kind="stable")[: limit // 4]]
-    return np.concatenate([order[:strongest], drawn])
-
-
-def local_sets(
-    compatible: Float32Array, seeds: IntArray, vote: Float32Array, size: int, witnesses: IntArray
-) -> tuple[IntArray, Float32Array]:
-    """For each seed the ``size`` correspondences with the largest second-order compatibility.
-
-    Returns:
-        Rows (M, size + 1), the seed first, and their weights (M, size + 1): S_ij = C_ij v_j sum_k C_ik
-        v_k C_kj over the ``witnesses`` k; the seed weighs as much as its best partner. Partners without any
-        compatibility weigh nothing.
-    """
-    size = min(size, len(compatible) - 1)
-    first = compatible[seeds]
-    second = np.ascontiguousarray(first[:, witnesses] * vote[witnesses]) @ compatible[witnesses]
-    second *= first
-    second *= vote
-    members = np.empty((len(seeds), size), dtype=np.int64)
-    weights = np.empty((len(seeds), size), dtype=np.float32)
-    rows = np.arange(len(seeds))
-    for rank in range(size):  # a few passes for the maximum are much faster than a partition
-        members[:, rank] = second.argmax(1)
-        weights[:, rank] = second[rows, members[:, rank]]
-        second[rows, members[:, rank]] = -1
-    seed_weight = weights.max(1, keepdims=True) + np.float32(1e-6)
-    return np.concatenate([seeds[:, None], members], 1), np.concatenate([seed_weight, weights], 1)
-
-
-def score(
-    R: FloatArray,
-    t: FloatArray,
-    known: FloatArray,
-    vote: Float32Array,
-    surroundings: Surroundings | None = None,
-) -> FloatArray:
-    """Sum of vote x exp(-r^2 / (2 0.75^2)) over all correspondences for each motion, (K,).
-
-    Residuals r in units of the inlier threshold; with surroundings each term is weighed by how well the
-    normals meet. A smooth kernel, somewhat narrower than the threshold, told right from wrong better than a
-    count or a truncated square.
-    """
-    scores = np.empty(len(R))
-    step = max(1, _SCORED_AT_ONCE // max(len(known), 1))
-    for start in range(0, len(R), step):
-        part = slice(start, start + step)
-        kernel = squared_residuals_shared(R[part], t[part], known).astype(np.float32)
-        kernel *= np.float32(-0.5 / 0.75**2)
-        np.exp(kernel, out=kernel)
-        if surroundings is not None:
-            kernel *= surroundings.matched(R[part])
-        scores[part] = kernel @ vote
-    return scores
-
-
-def refit(
-    R: FloatArray, t: FloatArray, known: FloatArray, vote: Float32Array
-) -> tuple[FloatArray, FloatArray]:
-    """One reweighted fit per motion on residuals under the threshold, weights vote / (1 + r^2).
-
-    A motion left with fewer than three inliers stays as it is.
-    """
-    r2 = squared_residuals_shared(R, t, known)
-    weights = vote * (r2 < 1)
-    enough = np.count_nonzero(weights, axis=1) >= 3
-    r2 += 1
-    R_new, t_new = fit_rigid_shared(known, weights / r2)
-    return np.where(enough[:, None, None], R_new, R), np.where(enough[:, None], t_new, t)

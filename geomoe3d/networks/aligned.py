@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.evidence import Met, kernel
 from geomoe3d.clouds.keypoints import KeypointSurfaces, Surface
-from geomoe3d.estimators.consensus import bundle_weights, distances
+from geomoe3d.estimators.compatibility import bundle_weights, distances
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
 from geomoe3d.types import Float32Array, FloatArray

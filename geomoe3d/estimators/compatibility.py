@@ -1,0 +1,119 @@
+"""Which correspondences agree with each other: what consensus asks before it fits anything.
+
+Compatibility of all pairs, seeds among them, and for each seed the correspondences that share most compatible partners
+with it (Chen et al., SC2-PCR, CVPR 2022). Lengths are in inlier thresholds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomoe3d.estimators.surroundings import Surroundings
+from geomoe3d.geometry.draws import Ranks
+from geomoe3d.runtime.threads import each
+from geomoe3d.types import Float32Array, FloatArray, IntArray
+
+BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
+PAIR_BLOCK = 125  # the same where several such blocks are worked on
+
+
+def bundle_weights(target: FloatArray) -> Float32Array:
+    """1 / sqrt(number of correspondences that share the target point), (N,) float32."""
+    _, inverse, counts = np.unique(target, axis=0, return_inverse=True, return_counts=True)
+    weights: Float32Array = (1.0 / np.sqrt(counts[inverse.ravel()])).astype(np.float32)
+    return weights
+
+
+def distances(a: Float32Array, b: Float32Array) -> Float32Array:
+    """(N, M) Euclidean distances of points (N, 3) and (M, 3), near zero, through one matrix product."""
+    a2, b2 = (a * a).sum(1, keepdims=True), (b * b).sum(1, keepdims=True)
+    # [-2a, |a|^2, 1] . [b, 1, |b|^2] = |a - b|^2 without a further pass over N x M numbers.
+    left, right = np.hstack([-2 * a, a2, np.ones_like(a2)]), np.hstack([b, np.ones_like(b2), b2])
+    found: Float32Array = left @ right.T
+    np.maximum(found, 0, out=found)
+    np.sqrt(found, out=found)
+    return found
+
+
+def compatibility(
+    source: Float32Array,
+    target: Float32Array,
+    tolerance: float = 1.0,
+    surroundings: Surroundings | None = None,
+) -> tuple[Float32Array, Float32Array]:
+    """Distances of the source points (N, N), and how compatible two correspondences are, in [0, 1].
+
+    0 where they do not preserve length; else 1, or how well their planes agree where those are known.
+    Points (N, 3) in inlier thresholds, as the tolerance; the diagonal of the second (N, N) is zero.
+    """
+    apart = np.empty((len(source), len(source)), dtype=np.float32)
+    compatible = np.empty_like(apart)
+
+    agree = None if surroundings is None else surroundings.of_pairs(source, target)
+
+    def fill(some: IntArray) -> None:
+        # Both are symmetric: from the diagonal on, and the same below it.
+        rows, rest = slice(some[0], some[-1] + 1), slice(some[0], None)
+        near = distances(source[rows], source[rest])
+        gap = distances(target[rows], target[rest])
+        gap -= near
+        found = np.less(np.abs(gap, out=gap), tolerance, out=gap, casting="unsafe")
+        if agree is not None:
+            found *= agree(rows, near)
+        for whole, part in ((apart, near), (compatible, found)):
+            whole[rows, rest] = part
+            whole[rest, rows] = part.T
+
+    each(fill, blocks(np.arange(len(source)), PAIR_BLOCK))
+    np.fill_diagonal(compatible, 0)
+    return apart, compatible
+
+
+def blocks(rows: IntArray, size: int = BLOCK) -> list[IntArray]:
+    """Rows in parts of at most ``size``, the same ones for any number of threads."""
+    return [rows[start : start + size] for start in range(0, len(rows), size)]
+
+
+def strengths(support: Float32Array, source_distance: Float32Array) -> Float32Array:
+    """Support (N,), half of it where a neighbour within the threshold has more, so that a dense bundle of wrong matches
+    does not take all places."""
+    beaten = ((source_distance < 1.0) & (support[None, :] > support[:, None])).any(1)
+    return np.where(beaten, np.float32(0.5) * support, support)
+
+
+def choose_seeds(strength: Float32Array, ranks: Ranks, limit: int) -> IntArray:
+    """Rows with the largest strength, and a quarter of the limit drawn from all others, those of the lowest ranks: they
+    give a second, weaker motion its proposals."""
+    if len(strength) <= limit:
+        return np.arange(len(strength))
+    order = np.argsort(-strength, kind="stable")
+    strongest = limit - limit // 4
+    rest = order[strongest:]
+    drawn = rest[np.argsort(ranks[rest], kind="stable")[: limit // 4]]
+    return np.concatenate([order[:strongest], drawn])
+
+
+def local_sets(
+    compatible: Float32Array, seeds: IntArray, vote: Float32Array, size: int, witnesses: IntArray
+) -> tuple[IntArray, Float32Array]:
+    """For each seed the ``size`` correspondences with the largest second-order compatibility.
+
+    Returns:
+        Rows (M, size + 1), the seed first, and their weights (M, size + 1): S_ij = C_ij v_j sum_k C_ik
+        v_k C_kj over the ``witnesses`` k; the seed weighs as much as its best partner. Partners without any
+        compatibility weigh nothing.
+    """
+    size = min(size, len(compatible) - 1)
+    first = compatible[seeds]
+    second = np.ascontiguousarray(first[:, witnesses] * vote[witnesses]) @ compatible[witnesses]
+    second *= first
+    second *= vote
+    members = np.empty((len(seeds), size), dtype=np.int64)
+    weights = np.empty((len(seeds), size), dtype=np.float32)
+    rows = np.arange(len(seeds))
+    for rank in range(size):  # a few passes for the maximum are much faster than a partition
+        members[:, rank] = second.argmax(1)
+        weights[:, rank] = second[rows, members[:, rank]]
+        second[rows, members[:, rank]] = -1
+    seed_weight = weights.max(1, keepdims=True) + np.float32(1e-6)
+    return np.concatenate([seeds[:, None], members], 1), np.concatenate([seed_weight, weights], 1)

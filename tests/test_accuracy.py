@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from small_scans import scene
 from surface_pairs import VOXEL, motion, prepared, surfaces
 
+from geomoe3d.cli.summary import summary
 from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.clouds.saving import save_aligned
@@ -22,6 +23,7 @@ from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.result import RegistrationResult
 from geomoe3d.types import Accuracy, Correspondences, FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts
+from geomoe3d.visual.page import render_page
 
 FOUND = Accuracy(0.03, 0.6, 0.4, 0.01, 0.008, 0.007, 0.025, 0.004, 0.012, 0.11)
 
@@ -141,6 +143,20 @@ def test_the_words_name_each_figure() -> None:
     )
     assert none["inlier RMSE"] == "none: no correspondence is an inlier"
     assert dict(accuracy_facts(room_view().result)) == {"overlap": "60% of the source"}
+
+
+@pytest.mark.parametrize(
+    ("margin", "words"),
+    [
+        (np.log(20), "the second look prefers this transform 20 times to the best different one"),
+        (-np.log(3), "the second look prefers the best different one 3 times to this transform"),
+    ],
+)
+def test_the_margin_stands_on_the_console_and_on_the_page(margin: float, words: str) -> None:
+    view = room_view()
+    result = replace(view.result, evidence={**view.result.evidence, "margin": float(margin)})
+    assert words in summary(result)
+    assert words in render_page(replace(view, result=result))
 
 
 def test_the_paragraph_and_the_figures_name_one_overlap() -> None:

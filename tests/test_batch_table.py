@@ -9,8 +9,10 @@ import pytest
 
 from geomoe3d import register_pairs
 from geomoe3d.batch.folder import page_name, transform_name
+from geomoe3d.batch.store import results_table
 from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
 from geomoe3d.errors import FormatError, InputError
+from geomoe3d.runtime.csv_text import csv_text
 
 
 def test_paths_are_relative_to_the_table_and_ids_are_made_where_missing(tmp_path):
@@ -104,3 +106,20 @@ def test_what_is_no_path_is_named(tmp_path, pairs, message):
     with pytest.raises(InputError, match=message):
         register_pairs(pairs, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [("CON", "%43ON"), ("nul.a", "%6Eul.a"), ("com1 ", "%63om1 "), ("Console", "Console"), (" x", "%20x")],
+)
+def test_no_file_has_a_name_that_windows_forbids(name, stem):
+    assert transform_name(name) == f"{stem}.txt"
+    assert not set(transform_name('a:b?c*"<|>\\')) & set(':?*"<|>\\')
+
+
+def test_no_text_of_a_table_is_a_formula():
+    rows = [["=1+1", "@x", "+a", "-b", "\tc"], ["-1.5", -2.5, "a=b", "", None]]
+    text = csv_text(["id", "a", "b", "c", "d"], rows)
+    assert text == "id,a,b,c,d\n'=1+1,'@x,'+a,'-b,'\tc\n-1.5,-2.5,a=b,,\n"
+    record = {"id": "=1+1", "error": "@no", "result": None}
+    assert results_table([record]).splitlines()[1] == f"'=1+1,error{',' * 19}'@no"

@@ -280,6 +280,26 @@ def test_a_value_for_a_section_names_keys_that_there_are() -> None:
 
 
 @pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        (
+            "second_look.scorers=none",
+            r"'none': it must be a list in brackets, such as \[a, b\], or \[\] for none$",
+        ),
+        ("expert.scale.reaches=2", "= 2: it must be a list"),
+        ("second_look.grids=[a]", "'second_look.grids.0' = 'a': it must be a number$"),
+        ("descriptor.options=3", "it must be pairs of name and value in braces"),
+        ("estimator.name=3", "= 3: it must be text$"),
+        ("preparation.max_points=1.5", "it must be a whole number$"),
+        ("refinement.parallel=maybe", "it must be true or false$"),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_told_of_without_words_of_python(assignment: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_config(None, [assignment])
+
+
+@pytest.mark.parametrize(
     "key",
     [
         "expert.scale.reaches",

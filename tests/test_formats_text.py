@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from cloud_files import fails, small_cloud
 
+from geomoe3d.clouds.formats.raw import RawCloud
+from geomoe3d.clouds.formats.text import write_csv
 from geomoe3d.clouds.io import load_points, save_aligned, save_points
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.errors import EmptyCloudError
@@ -144,3 +146,10 @@ def test_names_in_quotes_are_names(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text('x,y,z,,""\n1,2,3,7,8\n4,5,6,7,8\n')
     assert list(read_raw(tmp_path / "a.csv").fields) == ["column_4", "column_5"]
     assert save_aligned(tmp_path / "a.ply", tmp_path / "a.csv", np.eye(4)) == ()
+
+
+def test_no_name_of_a_column_is_a_formula(tmp_path: Path) -> None:
+    cloud = RawCloud(np.eye(3), fields={"=1+1": np.ones(3), "a-b": np.ones(3)})
+    with (tmp_path / "a.csv").open("wb") as handle:
+        write_csv(handle, cloud)
+    assert (tmp_path / "a.csv").read_text().splitlines()[0] == "X,Y,Z,_1+1,a-b"

@@ -27,6 +27,7 @@ TABLE_HEAD = "id,status,confidence,overlap,"
 PAGE_MARK = '<meta name="generator" content="geomoe3d batch">'
 
 _KIND = "geomoe3d batch "
+_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in range(10))}
 _TRANSFORM_HEAD = re.compile(  # the rows stand behind the remarks in batches of old
     r"(?:[^#\n]*\n){0,4}# maps SOURCE \(.*\) into TARGET \(.*\): p_target = (?:[\d.e+-]+ )?R p_source \+ t\r?\n"
     r"# status \w+, confidence [\d.]+\r?\n(?:# pair (.*?)\r?\n)?(?:[^#]|$)"
@@ -177,9 +178,14 @@ def page_name(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """An id as a file name; a dot at its beginning is odd too, since it would hide the file."""
+    """An id as a file name that every system takes.
+
+    Odd too are a dot at its beginning, which would hide the file, and, on Windows, names of devices and a blank at
+    the beginning.
+    """
     stem = quote(name, safe=" +=,@")
-    return f"%2E{stem[1:]}" if stem.startswith(".") else stem
+    device = stem.split(".")[0].rstrip().upper() in _DEVICES
+    return f"%{ord(stem[0]):02X}{stem[1:]}" if device or stem[0] in ". " else stem
 
 
 def pair_mark(name: str) -> str:

@@ -8,8 +8,6 @@ same for spreadsheets.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Iterable
@@ -38,6 +36,7 @@ from geomoe3d.decision.answer import library_versions
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.result import RegistrationResult
+from geomoe3d.runtime.csv_text import csv_text
 from geomoe3d.runtime.files import write_atomically, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
 from geomoe3d.runtime.provenance import differences, hardware, in_words, source_commit
@@ -213,16 +212,13 @@ def results_table(records: Iterable[dict[str, Any]]) -> str:
 
     Cells without a value are empty; in place of reasons stands the error of a pair that has no result.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*TABLE_HEAD.rstrip(",").split(","), *MATRIX_COLUMNS, "reasons"])
+    rows: list[list[Any]] = []
     for record in records:
         result = record["result"]
         if result is None:
-            writer.writerow([record["id"], "error", *[""] * 18, record["error"]])
+            rows.append([record["id"], "error", *[""] * 18, record["error"]])
             continue
         matrix = [value for row in result["T_target_source"] for value in row]
         numbers = [result["confidence"], result["overlap"], *matrix]
-        cells = ["" if value is None else repr(value) for value in numbers]
-        writer.writerow([record["id"], result["status"], *cells, "; ".join(result["reasons"])])
-    return out.getvalue()
+        rows.append([record["id"], result["status"], *numbers, "; ".join(result["reasons"])])
+    return csv_text([*TABLE_HEAD.rstrip(",").split(","), *MATRIX_COLUMNS, "reasons"], rows)

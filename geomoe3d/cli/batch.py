@@ -98,8 +98,7 @@ def table(report: BatchReport) -> str:
     width = min(40, max((len(outcome.id) for outcome in shown), default=0))
     for outcome in shown:
         reason = outcome.error if outcome.result is None else "; ".join(outcome.result.reasons[:1])
-        name = outcome.id if len(outcome.id) <= width else "…" + outcome.id[-(width - 1) :]
-        lines.append(f"  {name:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
+        lines.append(f"  {outcome.id:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
     if len(doubtful) > len(shown):
         lines.append(f"  and {len(doubtful) - len(shown):,} more that are not ok")
     return "\n".join(lines)

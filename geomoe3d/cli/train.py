@@ -99,7 +99,9 @@ def _overfit(settings: TrainConfig, quiet: bool) -> int:
 
     steps, f1 = overfit_one_batch(settings, report=report)
     reached = f1 > RULES.learnt_f1
-    click.echo(f"F1 {f1:.4f} after {steps} steps on one batch of {settings.batch_size} pairs", err=False)
+    click.echo(
+        f"F1 {f1:.4f} after {steps} steps on one batch of {counted(settings.batch_size, 'pair')}", err=False
+    )
     if not reached:
         click.echo(f"did not reach {RULES.learnt_f1}: network, losses or data are at fault", err=True)
     return 0 if reached else ExitCode.NOT_SURE

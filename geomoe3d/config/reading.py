@@ -18,6 +18,17 @@ _INSTALLED = Path(__file__).parents[1] / "configs"  # in a checkout they stand b
 _CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "configs"
 
 
+_KINDS = {
+    "tuple_type": "it must be a list in brackets, such as [a, b], or [] for none",
+    "dict_type": "it must be pairs of name and value in braces, such as {a: 1, b: 2}, or {} for none",
+    "string_": "it must be text",
+    "float_": "it must be a number",
+    "int_": "it must be a whole number",
+    "bool_": "it must be true or false",
+}
+"""What pydantic says of a value of the wrong kind (the beginning of the error's type), in words without Python."""
+
+
 def known_keys(section: type[Section], prefix: str = "") -> list[str]:
     """Dotted names of every leaf of a configuration tree, in declaration order."""
     keys: list[str] = []
@@ -147,7 +158,8 @@ def _explain(error: ValidationError, section: type[Section]) -> str:
             parts.append(f"'{key}' is a section, found {problem['input']!r}; did you mean {meant}?")
         else:
             said = problem["msg"].removeprefix("Value error, ").replace("Input should be", "it must be")
-            parts.append(f"'{key}' = {problem['input']!r}: {said}")
+            kind = next((words for start, words in _KINDS.items() if problem["type"].startswith(start)), said)
+            parts.append(f"'{key}' = {problem['input']!r}: {kind}")
     return "; ".join(parts)
 
 

@@ -96,7 +96,9 @@ def _open(path: Path, report: CheckReport) -> None:
         report.broken.append(str(error) if str(path) in str(error) else f"'{path}': {error}")
         return
     if cloud.num_non_finite:
-        report.notes.append(f"'{path}': {cloud.num_non_finite} points are not finite and are dropped")
+        report.notes.append(
+            f"'{path}': dropped {counted(cloud.num_non_finite, 'point')} with NaN or infinite coordinates"
+        )
     if not np.ptp(cloud.points, axis=0).any():
         report.broken.append(f"'{path}': all {len(cloud)} points are equal")
 

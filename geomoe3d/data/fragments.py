@@ -104,7 +104,9 @@ def make_fragments(
         if progress is not None:
             progress(number + 1, len(runs))
     if not clouds:
-        raise InputError(f"'{recording.folder}': no fragment came of {len(recording.frames)} frames")
+        raise InputError(
+            f"'{recording.folder}': no fragment came of {counted(len(recording.frames), 'frame')}"
+        )
     entries, overlaps = relate(clouds, poses, min_overlap)
     write_gt_log(folder / "gt.log", entries, len(clouds))
     write_gt_overlap(folder / "gt_overlap.log", overlaps)

@@ -62,9 +62,9 @@ def remarks(
         )
     if not sensors_known and config.viewpoint in ("auto", "guess"):
         yield (
-            "where the sensors stood is not known and was guessed; more answers are right where it is given: "
-            "--sensor-source X,Y,Z and --sensor-target, or --set preparation.viewpoint=origin if they stood at the "
-            "files' origins"
+            "where the sensors stood is not known and was guessed; more answers are right where it is given: --set "
+            "preparation.viewpoint=origin if they stood at the files' origins, or else, of a single pair, "
+            "`geomoe3d register` with --sensor-source X,Y,Z and --sensor-target"
         )
 
 

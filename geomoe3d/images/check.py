@@ -13,6 +13,7 @@ from geomoe3d.images.config import KEYPOINTS, TRUTH
 from geomoe3d.images.features import Keypoints, detect, match
 from geomoe3d.images.pose import residuals_of
 from geomoe3d.images.scenes import choose_pairs
+from geomoe3d.runtime.words import counted
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def check_truth(scene: ImageScene, pairs: int = 40, seed: int = 0) -> TruthCheck
     far = np.concatenate(found) if found else np.zeros(0)
     if len(far) == 0:
         raise InputError(
-            f"'{scene.name}': {len(chosen)} pairs are turned by 3 to 20 degrees, with no match between them; "
+            f"'{scene.name}': no match in {counted(len(chosen), 'pair')} turned by 3 to 20 degrees; "
             "nothing says whether its cameras are true"
         )
     share, median = float((far < 2.0).mean()), float(np.median(far))

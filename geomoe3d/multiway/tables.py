@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
+
+from geomoe3d.runtime.csv_text import csv_text
 
 if TYPE_CHECKING:
     from geomoe3d.multiway.model import SceneModel
@@ -31,7 +30,7 @@ def scans_text(model: SceneModel) -> str:
         worst = f"{max(shifts):.4g}" if shifts else ""
         reason = model.unplaced.get(scan.name, "" if mine else "held loosely: no single pair is kept")
         rows.append([scan.name, number, *place, len(mine), worst, reason, scan.path])
-    return _text(_SCANS, rows)
+    return csv_text(_SCANS, rows)
 
 
 def edges_text(model: SceneModel) -> str:
@@ -45,12 +44,4 @@ def edges_text(model: SceneModel) -> str:
         ]
         for edge in model.edges
     ]  # fmt: skip
-    return _text(_EDGES, rows)
-
-
-def _text(header: tuple[str, ...], rows: Iterable[Sequence[object]]) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return stream.getvalue()
+    return csv_text(_EDGES, rows)

@@ -63,13 +63,12 @@ def differences(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, tup
     }
 
 
-def in_words(differing: dict[str, tuple[str, str]], most: int = 3, longest: int = 60) -> str:
-    """Differences in one line: the first few with their values, and how many more there are."""
-
-    def short(value: str) -> str:
-        return value if len(value) <= longest else f"{value[: longest - 3]}..."
-
-    told = [f"{key} ({short(a)} there, {short(b)} now)" for key, (a, b) in list(differing.items())[:most]]
+def in_words(differing: dict[str, tuple[str, str]], most: int = 3, longest: int = 40) -> str:
+    """Differences in one line: the first few, with their values unless long (hashes), and how many more there are."""
+    told = [
+        f"{key} ({a} there, {b} now)" if max(len(a), len(b)) <= longest else key
+        for key, (a, b) in list(differing.items())[:most]
+    ]
     rest = len(differing) - len(told)
     return "; ".join(told) + (f"; and in {rest} more" if rest else "")
 

@@ -21,6 +21,10 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
     """Name and text of each figure, lengths in the files' unit; no more than the overlap where nothing was measured."""
     found = result.accuracy
     facts = [] if result.scale == 1.0 else [("scale", _scale(result))]
+    margin = result.evidence.get("margin")
+    if margin is not None:
+        this, other = ("this transform", "the best different one")[:: 1 if margin >= 0 else -1]
+        facts.append(("margin", f"the second look prefers {this} {np.exp(abs(margin)):.3g} times to {other}"))
     if found is None:
         overlap = f"{result.overlap:.0%} of the source" if np.isfinite(result.overlap) else "not known"
         return [*facts, ("overlap", overlap)]

@@ -216,7 +216,7 @@ def _drawn(view: RegistrationView, drawing: Drawing) -> str:
         ("target", drawing.target, view.target_points),
     ):
         of_all = "all" if len(drawn) == len(points) else f"{len(drawn):,} of"
-        parts.append(f"{of_all} {len(points):,} {name} points")
+        parts.append(f"{of_all} {counted(len(points), name + ' point')}")
     text = f"Drawn: {' and '.join(parts)}"
     if len(drawing.source) < len(view.source_points) or len(drawing.target) < len(view.target_points):
         text += f", chosen evenly over the surface with seed {view.result.seed}"

@@ -17,6 +17,7 @@ import numpy as np
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import DependencyError, FormatError
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -124,7 +125,9 @@ def _read_scan(libe57: Any, file: Any, index: int) -> RawCloud:
         buffers.append(libe57.SourceDestBuffer(file.image_file, name, array, count, True, True))
     held = header.points.reader(buffers).read()
     if held != count:
-        raise FormatError(f"'{file.path}': scan {index} says {count} points, the file holds {held}")
+        raise FormatError(
+            f"'{file.path}': scan {index} says {counted(count, 'point')}, the file holds {held}"
+        )
     points = np.stack([data[name] for name in axes], axis=1)
     if axes is _SPHERICAL:
         points = _cartesian(points)

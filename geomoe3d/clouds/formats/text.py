@@ -314,7 +314,7 @@ def _write_text(handle: BinaryIO, cloud: RawCloud, separator: str, remark: str) 
         names += ["Rf", "Gf", "Bf"]
         parts.append(cloud.colors)
     for name, values in cloud.fields.items():
-        names.append(re.sub(r"[\s,;]+", "_", name))
+        names.append(re.sub(r"[\s,;]+|^[=+@-]", "_", name))  # also what spreadsheets take for a formula
         parts.append(values[:, None])
     if not remark or len(names) > 3:
         handle.write((remark + separator.join(names) + "\n").encode())

@@ -16,7 +16,7 @@ import numpy as np
 
 from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import bounded_voxel_size, own_voxel_sizes, round_size
-from geomoe3d.clouds.viewpoint import known_viewpoints, seen_by_none, sign_breaks
+from geomoe3d.clouds.viewpoint import check_both_known, known_viewpoints, seen_by_none, sign_breaks
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
@@ -102,6 +102,7 @@ class Line:
                 back = None if self.initial is None else inverse(self.initial)
                 return self._in_map(clouds[::-1], back).exchanged()
             wanted = round_size(max(sizes))
+        check_both_known(clouds)
         voxel_size = bounded_voxel_size(*clouds, wanted, config.preparation.max_points)
         rule = config.preparation.viewpoint
         # Known places, not guessed ones: the network was trained on true ones, or none.
@@ -313,8 +314,6 @@ class Line:
             reason = nowhere(*(cloud.name for cloud in clouds))
             return Explanation(failed_result(clouds, reason, self.config, self.clock.stop()), *clouds)
         decision = found.decision
-        if decision.judgement.status != "ok" and (units := self._units(clouds)) is not None:
-            decision = decision.with_note(units, first=True)
         for remark in clouds[1].notes:
             decision = decision.with_note(remark)
         weighed = FilterOutput(np.zeros(len(found.pair.matched)))

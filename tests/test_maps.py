@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from geomoe3d.config import expert, load_config
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps import store
+from geomoe3d.maps.finding import Finder
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.places import Query
 
@@ -202,11 +204,42 @@ def test_a_map_of_another_descriptor_is_described_anew(house, scan, tmp_path, mo
 def test_units_and_sizes_that_cannot_be_fail_with_the_reason(house, scan):
     larger = house.locate(1000.0 * scan[0])
     assert larger.status == "failed"
-    assert "larger than the map" in larger.result.reasons[0]
+    assert "seems to be in millimetres" in larger.result.reasons[0]
     assert np.isnan(larger.T_map_scan).all()
-    smaller = house.locate(0.001 * scan[0])
+    smaller = house.locate(0.004 * scan[0])
     assert smaller.status == "failed"
     assert "too coarse" in smaller.result.reasons[0]
+    neither = house.locate(300.0 * scan[0])
+    assert "larger than the map" in neither.result.reasons[0]
+
+
+@pytest.mark.parametrize("times", [1 / 0.3048, 0.3048])
+def test_a_scan_in_feet_is_never_ok_and_the_units_are_named(house, scan, times):
+    found = house.locate(times * scan[0])
+    assert not found.ok
+    assert re.match(r"units differ: .*'scan' seems to be in (feet|metres)", found.result.reasons[0])
+
+
+def test_where_the_sensor_stood_may_be_given_and_is_then_believed(house, scan):
+    points, true = scan
+    moved = make_transform(np.eye(3), np.array([-40.0, 70.0, 5.0]))
+    found = house.locate(points + moved[:3, 3], sensor=moved[:3, 3])
+    assert found.ok
+    assert shift(found.T_map_scan @ moved, true) < 0.05
+    with pytest.raises(InputError, match="sensor of the scan"):
+        house.locate(points, sensor=(1, 2))
+    others = [], []
+    for sensor, normals in zip((None, "none"), others, strict=True):
+
+        def begun(self, cloud, view, level, clock, _made=Finder._begun, normals=normals):
+            search = _made(self, cloud, view, level, clock)
+            normals.append(search.scan.normals)
+            return search
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Finder, "_begun", begun)
+            house.locate(points, sensor=sensor)
+    assert (others[0][0] != others[1][0]).any()  # turned to the sensor, and to the middle
 
 
 @pytest.mark.parametrize("times", [1000.0, 0.001])
@@ -251,6 +284,34 @@ def test_index_and_locate_in_the_shell(rooms, scan, tmp_path, monkeypatch, capfd
     assert "three numbers" in capfd.readouterr().err
     assert ask("locate", "scan.npy", "nowhere.map") == ExitCode.BAD_INPUT
     assert "there is no map 'nowhere.map'" in capfd.readouterr().err
+
+
+def test_quietly_one_scan_prints_its_matrix_and_what_is_not_ok_one_line(
+    house, scan, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    house.save("house.map")
+    np.save("scan.npy", scan[0])
+    np.save("feet.npy", scan[0] / 0.3048)
+    words = ("house.map", "--voxel-size", GRID, "--quiet")
+    assert ask("locate", "scan.npy", *words) == ExitCode.OK
+    told = capfd.readouterr()
+    assert told.err == ""
+    rows = np.array([[float(word) for word in line.split()] for line in told.out.splitlines()])
+    assert shift(rows, scan[1]) < 0.05
+    assert ask("locate", "scan.npy", "feet.npy", *words) == ExitCode.NOT_SURE
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert told.err.startswith("feet: ")
+
+
+def test_lengths_are_printed_with_the_unit_that_is_named(house, scan, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    house.save("house.map")
+    np.save("scan.npy", scan[0])
+    assert ask("locate", "scan.npy", "house.map", "--voxel-size", GRID, "--unit", "m") == ExitCode.OK
+    assert f"{GRID:g} m" in capfd.readouterr().out
 
 
 def test_what_is_no_map_is_never_overwritten(tmp_path, monkeypatch, capfd):

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from geomoe3d.cli.register import command
-from geomoe3d.clouds.viewpoint import find_viewpoints, seen_by_none, with_sensors
+from geomoe3d.clouds.viewpoint import check_both_known, find_viewpoints, seen_by_none, with_sensors
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.types import PointCloud
@@ -49,7 +49,7 @@ def test_what_is_no_place_is_refused(sensor: object) -> None:
 @pytest.mark.parametrize("sensors", [(FAR, None), (None, FAR), (FAR, "none")])
 def test_one_place_alone_is_refused_where_the_other_is_not_known(sensors: tuple) -> None:
     with pytest.raises(InputError, match="one alone is of no use"):
-        with_sensors(clouds(), sensors, "auto")
+        check_both_known(with_sensors(clouds(), sensors, "auto"))
 
 
 def test_a_place_and_another_rule_exclude_each_other() -> None:

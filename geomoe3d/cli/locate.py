@@ -7,17 +7,20 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import check_outputs, part_option
-from geomoe3d.cli.parts import configuration_options
+from geomoe3d.cli.parts import configuration_options, sensor_place, unit_option
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
     from geomoe3d.maps.location import Location
+    from geomoe3d.types import FloatArray
+
+Form = Literal["text", "json", "quiet"]
 
 
 @click.command(context_settings=HELP, short_help="Find scans in a map, and say how sure.")
@@ -37,12 +40,23 @@ if TYPE_CHECKING:
 @click.option(
     "--initial", metavar="FILE", help="A first guess of the transform, as of `register`; one scan only."
 )
+@click.option(
+    "--sensor",
+    metavar="X,Y,Z",
+    help="Where each scan's sensor stood, in the scan's own coordinates; none: no one sensor. [found from the scan]",
+)
+@unit_option
 @click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per scan and nothing else.")
 @click.option(
     "--output", metavar="FILE.tum", help="Write the poses that are ok as TUM text, one line per scan."
 )
 @click.option("--force", is_flag=True, help="Replace an output file that exists.")
-@click.option("--quiet", is_flag=True, help="No progress.")
+@click.option(
+    "--quiet",
+    is_flag=True,
+    help="No progress; the four rows of the matrix alone (of several scans none: give --output), and one line on "
+    "stderr for each that is not ok.",
+)
 @part_option("reader")
 @traceback_option
 @click.pass_context
@@ -54,6 +68,8 @@ def command(
     near: str | None,
     within: float | None,
     initial: str | None,
+    sensor: str | None,
+    unit: str,
     as_json: bool,
     output: str | None,
     force: bool,
@@ -84,18 +100,25 @@ def command(
         if initial is not None and len(scans) > 1:
             raise click.UsageError(f"--initial is a guess of one scan, found {len(scans)}")
         guess = None if initial is None else load_transform(initial)
-        prior = None if near is None else _numbers(near)
+        prior, stood = None if near is None else _numbers(near), sensor_place(sensor, "--sensor")
         if Path(inputs[-1]).suffix.lower() == ".map":
             within_map = Map.open(inputs[-1], config=config)
         else:
             within_map = Map.from_cloud(inputs[-1], config=config, progress=stage)
+    form: Form = "json" if as_json else "quiet" if quiet else "text"
     found: list[tuple[str, Location | None]] = []
     begin = time.monotonic()
     for scan in scans:
         try:
             with stdout_to_stderr(), stage_display(quiet) as stage:
                 location = within_map.locate(
-                    scan.path, k=places, near=prior, within=within, initial=guess, progress=stage
+                    scan.path,
+                    k=places,
+                    near=prior,
+                    within=within,
+                    initial=guess,
+                    sensor=stood,
+                    progress=stage,
                 )
         except InputError as error:
             if len(scans) == 1:
@@ -103,8 +126,9 @@ def command(
             click.echo(f"{scan.name}: {error}", err=True)
             location = None
         found.append((scan.name, location))
-        _print(scan.name, location, as_json, len(scans) == 1)
-    if len(scans) > 1 and not as_json:
+        if location is not None:
+            _print(scan.name, location, form, len(scans) == 1, unit)
+    if len(scans) > 1 and form == "text":
         sure = sum(location is not None and location.ok for _, location in found)
         rate = len(scans) / max(time.monotonic() - begin, 1e-9)
         click.echo(f"{sure} of {len(scans)} ok; {rate:.2f} scans per second")
@@ -126,25 +150,28 @@ def _numbers(text: str) -> list[float]:
     return numbers
 
 
-def _print(name: str, location: Location | None, as_json: bool, alone: bool) -> None:
-    if location is None:
-        return
-    if as_json:
-        click.echo(json.dumps({"scan": name, **json.loads(location.to_json(None))}))
-        return
-    if not alone:
-        place = " ".join(f"{value:.3f}" for value in location.T_map_scan[:3, 3])
-        reason = f"; {location.result.reasons[0]}" if location.result.reasons else ""
-        click.echo(
-            f"{name}: {location.status} (confidence {location.result.confidence:.2f}) at {place}{reason}"
-        )
-        return
-    from geomoe3d.cli.summary import summary
+def _print(name: str, location: Location, form: Form, alone: bool, unit: str) -> None:
+    """One scan's answer; ``alone``: it is the only scan."""
+    from geomoe3d.cli.summary import print_quietly, summary
 
-    click.echo(summary(location.result), color=False if os.environ.get("NO_COLOR") else None)
-    for number, place_found in enumerate(location.places[1:], start=2):
-        at = " ".join(f"{value:.3f}" for value in place_found.T_map_scan[:3, 3])
-        click.echo(f"place {number}: at {at}, {100 * place_found.relative_score:.0f} % of the score")
+    result = location.result
+    if form == "json":
+        click.echo(json.dumps({"scan": name, **json.loads(location.to_json(None))}))
+    elif form == "quiet":
+        print_quietly(result, matrix=alone, name="" if alone else name)
+    elif alone:
+        click.echo(summary(result, unit=unit), color=False if os.environ.get("NO_COLOR") else None)
+        for number, place in enumerate(location.places[1:], start=2):
+            share = f"{100 * place.relative_score:.0f} % of the score"
+            click.echo(f"place {number}: at {_at(place.T_map_scan, unit)}, {share}")
+    else:
+        reason = f"; {result.reasons[0]}" if result.reasons else ""
+        at = "" if location.status == "failed" else f" at {_at(location.T_map_scan, unit)}"
+        click.echo(f"{name}: {location.status} (confidence {result.confidence:.2f}){at}{reason}")
+
+
+def _at(T_map_scan: FloatArray, unit: str) -> str:
+    return " ".join(f"{value:.3f}" for value in T_map_scan[:3, 3]) + f" {unit}".rstrip()
 
 
 def _write(path: str, found: Sequence[tuple[str, Location | None]], force: bool) -> None:

@@ -50,6 +50,30 @@ def scale_option(command: Command) -> Command:
     return result
 
 
+def unit_option(command: Command) -> Command:
+    """Adds ``--unit``."""
+    result: Command = click.option(
+        "--unit",
+        metavar="NAME",
+        default="",
+        help="Name of the files' unit of length, such as m; shown behind lengths, nothing is converted.",
+    )(command)
+    return result
+
+
+def sensor_place(text: str | None, option: str) -> Any:
+    """What a user says of a sensor: three numbers, ``none``, or None for nothing."""
+    if text is None or text.strip().lower() == "none":
+        return None if text is None else "none"
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"'{text}' is no place; give X,Y,Z in the file's coordinates, or none", param_hint=option
+        ) from None
+    return x, y, z
+
+
 def cache_options(command: Command) -> Command:
     """Adds ``--cache`` and ``--no-cache``; the command gets ``cache``, empty for none."""
 

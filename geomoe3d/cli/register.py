@@ -11,7 +11,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
 from geomoe3d.cli.files import check_outputs, part_option
-from geomoe3d.cli.parts import configuration_options, scale_option
+from geomoe3d.cli.parts import configuration_options, scale_option, sensor_place, unit_option
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
@@ -77,12 +77,7 @@ class _Outputs:
 @click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
 @click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
 @click.option("--report", metavar="FILE", help="Write one sheet for a customer: .pdf.")
-@click.option(
-    "--unit",
-    metavar="NAME",
-    default="",
-    help="Name of the files' unit of length, such as m; shown behind lengths, nothing is converted.",
-)
+@unit_option
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
 @click.option("--force", is_flag=True, help="Replace output files that exist.")
 @click.option(
@@ -145,7 +140,10 @@ def command(
         guess = None if initial is None else load_transform(initial)
         matches = None if correspondences is None else load_correspondences(correspondences)
         registrar = Registrar(config if weights is None else with_weights(config, weights))
-        sensors = _place(sensor_source, "--sensor-source"), _place(sensor_target, "--sensor-target")
+        sensors = (
+            sensor_place(sensor_source, "--sensor-source"),
+            sensor_place(sensor_target, "--sensor-target"),
+        )
         told: dict[str, Any] = {
             "initial": guess,
             "correspondences": matches,
@@ -174,30 +172,14 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
     if as_json:
         click.echo(answer.to_json())
     elif quiet:
-        from geomoe3d.clouds.transform_files import has_transform, transform_text
+        from geomoe3d.cli.summary import print_quietly
 
-        if has_transform(answer):
-            click.echo(transform_text(answer.T_target_source, []), nl=False)
-        if not answer.ok:
-            click.echo(f"{answer.status.replace('_', ' ')}: {(*answer.reasons, 'no reason')[0]}", err=True)
+        print_quietly(answer)
     else:
         from geomoe3d.cli.summary import summary
 
         color = False if os.environ.get("NO_COLOR") else None
         click.echo(summary(answer, inverted, unit), color=color)
-
-
-def _place(text: str | None, option: str) -> Any:
-    """``none``, or three numbers."""
-    if text is None or text.strip().lower() == "none":
-        return None if text is None else "none"
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise click.BadParameter(
-            f"'{text}' is no place; give X,Y,Z in the file's coordinates, or none", param_hint=option
-        ) from None
-    return x, y, z
 
 
 def _check_outputs(outputs: _Outputs, inputs: Sequence[str], scale: float | None, force: bool) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from geomoe3d.clouds.transform_files import has_transform
+from geomoe3d.clouds.transform_files import has_transform, transform_text
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import CloudReport, FloatArray
@@ -48,6 +48,21 @@ def summary(result: RegistrationResult, inverted: bool = False, unit: str = "") 
     else:
         lines.append("no transform was found")
     return "\n".join(lines)
+
+
+def print_quietly(result: RegistrationResult, *, matrix: bool = True, name: str = "") -> None:
+    """The four rows of the matrix alone, and one line on stderr where the answer is not ok.
+
+    Args:
+        result: what is to be shown.
+        matrix: leave False to print no rows.
+        name: of the scan, to stand before the line, or empty.
+    """
+    if matrix and has_transform(result):
+        click.echo(transform_text(result.T_target_source, []), nl=False)
+    if not result.ok:
+        told = f"{result.status.replace('_', ' ')}: {(*result.reasons, 'no reason')[0]}"
+        click.echo(f"{name}: {told}" if name else told, err=True)
 
 
 def direction(result: RegistrationResult, inverted: bool = False) -> str:

@@ -54,39 +54,37 @@ def known_viewpoints(
 def with_sensors(
     clouds: tuple[PointCloud, PointCloud], sensors: Sensors, rule: str
 ) -> tuple[PointCloud, PointCloud]:
-    """Source and target, of whose sensors the user knows something.
+    """Source and target, of whose sensors the user knows something; see `with_sensor`, each of ``sensors`` as there."""
+    source, target = (
+        with_sensor(cloud, sensor, rule, whose)
+        for cloud, sensor, whose in zip(clouds, sensors, ("source", "target"), strict=True)
+    )
+    return source, target
+
+
+def with_sensor(
+    cloud: PointCloud, sensor: ArrayLike | Literal["none"] | None, rule: str, whose: str = "scan"
+) -> PointCloud:
+    """A cloud of whose sensor the user knows something.
 
     Args:
-        clouds: as loaded.
-        sensors: of each (3,) where it stood, file coordinates; ``none`` where no one sensor saw the cloud, as a merged
-            one, a mesh or a whole object; None leaves it to the evidence.
+        cloud: as loaded.
+        sensor: (3,) where it stood, file coordinates; ``none`` where no one sensor saw the cloud, as a merged one, a
+            mesh or a whole object; None leaves it to the evidence.
         rule: that of the configuration, which must then be ``auto``.
+        whose: what to call the cloud in messages.
 
     Raises:
-        InputError: a place that is none, or one place where the other scan's is neither given nor found.
+        InputError: a place that is none.
         ConfigError: another rule.
     """
-    if all(sensor is None for sensor in sensors):
-        return clouds
+    if sensor is None:
+        return cloud
     if rule != "auto":
         raise ConfigError(
             f"a sensor's place is given, but preparation.viewpoint is '{rule}', which decides it too; leave one of the "
             "two out"
         )
-    given = _with_sensor(clouds[0], sensors[0], "source"), _with_sensor(clouds[1], sensors[1], "target")
-    for one, other, whose in ((*given, "target"), (*given[::-1], "source")):
-        known = one.sensor_given and one.sensor is not None
-        if known and (_believed(other) is None):
-            raise InputError(
-                f"the place of one sensor is given, but that of the {whose} is not known, and one alone is of no use; "
-                f"give it too, or leave both out"
-            )
-    return given
-
-
-def _with_sensor(cloud: PointCloud, sensor: ArrayLike | Literal["none"] | None, whose: str) -> PointCloud:
-    if sensor is None:
-        return cloud
     if isinstance(sensor, str):
         if sensor != "none":
             raise InputError(
@@ -97,6 +95,20 @@ def _with_sensor(cloud: PointCloud, sensor: ArrayLike | Literal["none"] | None, 
     if place.shape != (3,) or not np.isfinite(place).all():
         raise InputError(f"the sensor of the {whose} must be three finite numbers X,Y,Z, found {sensor!r}")
     return replace(cloud, sensor=place, sensor_given=True)
+
+
+def check_both_known(clouds: tuple[PointCloud, PointCloud]) -> None:
+    """Refuse the place of one sensor, given by the user, where that of the other cloud is not known.
+
+    Raises:
+        InputError: normals of both must be turned by one rule, so that place would be of no use.
+    """
+    for one, other in (clouds, clouds[::-1]):
+        if one.sensor_given and one.sensor is not None and _believed(other) is None:
+            raise InputError(
+                f"the place of one sensor is given, that of '{one.name}', but that of '{other.name}' is not known, and "
+                "one alone is of no use; give it too, or leave both out"
+            )
 
 
 def seen_by_none(clouds: tuple[PointCloud, PointCloud]) -> bool:

@@ -8,7 +8,7 @@ from geomoe3d.clouds.prepare import robust_extent
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement
-from geomoe3d.decision.scale import likely_unit_ratio, seeming_units
+from geomoe3d.decision.scale import likely_unit_ratio, units_differ
 from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.result import RegistrationResult
@@ -37,11 +37,7 @@ def differing_units(
         return None
     if not fits:
         return None
-    names = f"'{source.name}'", f"'{target.name}'"  # not roles, which may be exchanged here
-    return (
-        f"units differ: with all lengths of '{source.name}' divided by {ratio:.6g} the clouds fit"
-        f"{seeming_units(ratio, names)}; bring both to one unit, a rigid transform cannot change scale"
-    )
+    return units_differ(ratio, source.name, target.name)  # not roles, which may be exchanged here
 
 
 def is_sure(judgement: Judgement) -> bool:

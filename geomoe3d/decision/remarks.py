@@ -64,7 +64,8 @@ def remarks(
         yield (
             "where the sensors stood is not known and was guessed; more answers are right where it is given: --set "
             "preparation.viewpoint=origin if they stood at the files' origins, or else, of a single pair, "
-            "`geomoe3d register` with --sensor-source X,Y,Z and --sensor-target"
+            "`geomoe3d register` with --sensor-source X,Y,Z and --sensor-target, of scans in a map `geomoe3d locate` "
+            "with --sensor X,Y,Z"
         )
 
 

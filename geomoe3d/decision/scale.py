@@ -136,6 +136,21 @@ def seeming_units(ratio: float, names: tuple[str, str] = ("the source", "the tar
     return ""
 
 
+def units_differ(ratio: float, source: str, target: str) -> str:
+    """A sentence for two clouds, by name, that fit once all lengths of the first are divided by a ratio."""
+    units = seeming_units(ratio, (f"'{source}'", f"'{target}'"))
+    return (
+        f"units differ: with all lengths of '{source}' divided by {ratio:.6g} the clouds fit{units}; bring both to one "
+        "unit, a rigid transform cannot change scale"
+    )
+
+
+def ratios_to_metres() -> tuple[float, ...]:
+    """Lengths of one cloud over those of another where just one of them is in metres, likelier units first."""
+    ratios = [_UNITS["metres"] / _UNITS[name] for name in ("feet", "millimetres", "centimetres", "inches")]
+    return tuple(value for ratio in ratios for value in (ratio, 1 / ratio))
+
+
 def likely_unit_ratio(extents: tuple[float, float]) -> float | None:
     """The ratio of units nearest to that of two extents (source, target), None where none is within 1.5."""
     if min(extents) <= 0:

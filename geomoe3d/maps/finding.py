@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from geomoe3d.clouds.prepare import bounded_voxel_size, choose_voxel_size, prepare
-from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.clouds.viewpoint import find_viewpoints, seen_by_none
 from geomoe3d.config import expert
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError
@@ -103,6 +103,22 @@ class Finder:
             decision = decision.with_note(sentence)
         return replace(best, decision=decision), ranked
 
+    def is_plainly_in(self, cloud: PointCloud, levels: Sequence[Level]) -> bool:
+        """Whether one quick look finds a scan, on the first of some grids that serves it; False where none does."""
+        own, coarsest = self._grids(cloud)
+        level = next((x for x in levels if own / expert().maps.finer <= x.voxel_size <= coarsest), None)
+        if level is None:
+            return False
+        view = find_viewpoints(cloud, cloud, self.line.config.preparation.viewpoint)[0]
+        try:
+            search = self._begun(cloud, view, level, StageClock())
+        except EmptyCloudError:
+            return False
+        if len(search.scan) < expert().maps.least_voxels:
+            return False
+        found = [search.look(h) for h in likely(search.candidates(), expert().maps.candidates)]
+        return bool(found) and search.decide(found)[0].decision.judgement.status == "ok"
+
     def _grids(self, cloud: PointCloud) -> tuple[float, float]:
         """Edges of the grid that suits a scan, and of the coarsest one that serves it."""
         preparation, given = self.line.config.preparation, self.line.config.voxel_size
@@ -115,9 +131,10 @@ class Finder:
     def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
         """The search for a scan on a level."""
         clock("preprocess")
-        bare = prepare(
-            cloud, level.voxel_size, self.line.config.preparation, viewpoint=view, seed=self.line.config.seed
-        )
+        config = self.line.config.preparation
+        if seen_by_none((cloud, cloud)):
+            config = config.model_copy(update={"viewpoint": "centroid"})
+        bare = prepare(cloud, level.voxel_size, config, viewpoint=view, seed=self.line.config.seed)
         clock("features")
         scan, compared = described(bare, self.line.descriptor)
         return Search(self.line, scan, compared, level, self._part(level), clock)

@@ -7,7 +7,7 @@ import os
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,8 +20,11 @@ from geomoe3d.clouds.prepare import (
     typical_spacing,
 )
 from geomoe3d.clouds.recentre import choose_origin
+from geomoe3d.clouds.viewpoint import with_sensor
 from geomoe3d.config import RegistrationConfig, build_config, expert, expert_in_force
-from geomoe3d.decision.answer import failed_result, finished_result
+from geomoe3d.decision.answer import Decision, failed_result, finished_result
+from geomoe3d.decision.scale import ratios_to_metres, units_differ
+from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
 from geomoe3d.maps.finding import Finder
@@ -221,6 +224,7 @@ class Map:
         near: ArrayLike | None = None,
         within: float | None = None,
         initial: ArrayLike | None = None,
+        sensor: ArrayLike | Literal["none"] | None = None,
         progress: Progress | None = None,
     ) -> Location:
         """Where a scan lies in the map.
@@ -236,11 +240,14 @@ class Map:
                 coordinates of the map. Looked at first; the whole map follows where nothing sure is found there.
             within: how far off that may be, cloud units; needed with ``near``.
             initial: (4, 4) a first guess of T_map_scan; scored like all others, not trusted.
+            sensor: (3,) where the scan's sensor stood, file coordinates of the scan; ``"none"`` where no one sensor saw
+                it; None leaves it to the evidence, as `geomoe3d.register` does.
             progress: called with the name of each stage as it begins.
 
         Raises:
-            InputError: a scan that cannot be read or has too few usable points, a guess that is no rigid transform, or
-                one of ``near`` and ``within`` without the other.
+            InputError: a scan that cannot be read or has too few usable points, a guess that is no rigid transform, a
+                sensor's place that is none, or one of ``near`` and ``within`` without the other.
+            ConfigError: a sensor's place, and a ``preparation.viewpoint`` that decides it too.
         """
         if not len(self._voxels):
             raise EmptyCloudError("the map holds no points yet; add a cloud first: map.with_cloud(...)")
@@ -250,21 +257,39 @@ class Map:
         clock("load")
         named = isinstance(scan, (str, os.PathLike, PointCloud))
         cloud = load_points(scan, seed=self.config.seed, name=None if named else "scan")
+        cloud = with_sensor(cloud, sensor, self.config.preparation.viewpoint)
         check_cloud(cloud)
         refused = self._refused(cloud)
         if refused is not None:
-            return self._nowhere(cloud, refused, clock)
+            return self._nowhere(cloud, self._in_other_unit(cloud, clock) or refused, clock)
         local = None if asked is None else (asked[0] - self._voxels.origin, asked[1])
         best, ranked = self._finder(cloud, scan, guesses, local, max(k, expert().maps.candidates), clock)
         if best is None or best.decision.answer is None:
             return self._nowhere(cloud, nowhere(cloud.name, self.name), clock)
-        result = finished_result(best.pair, best.decision, self.config, clock.stop())
+        decision = self._told(best.decision, cloud, clock)
+        result = finished_result(best.pair, decision, self.config, clock.stop())
         origins, top = (cloud.origin, self._voxels.origin), best.decision.answer.score
         places = tuple(
             Place(shift_frames(h.T_target_source, *origins), h.score / top if top > 0 else 1.0)
             for h in ranked[:k]
         )
         return Location(result, places)
+
+    def _told(self, decision: Decision, cloud: PointCloud, clock: StageClock) -> Decision:
+        """A decision, with the unit in which the scan would be found where it is not ok."""
+        if decision.judgement.status == "ok":
+            return decision
+        units = self._in_other_unit(cloud, clock)
+        return decision if units is None else decision.with_note(units, first=True)
+
+    def _in_other_unit(self, cloud: PointCloud, clock: StageClock) -> str | None:
+        """A sentence where a scan that is not found lies in the map once it is brought to another unit, else None."""
+        clock("units")
+        for ratio in ratios_to_metres():
+            scaled = scaled_cloud(cloud, 1 / ratio)
+            if self._refused(scaled) is None and self._finder.is_plainly_in(scaled, self._levels):
+                return units_differ(ratio, cloud.name, self.name)
+        return None
 
     @property
     def _finder(self) -> Finder:
@@ -392,4 +417,5 @@ def search_larger(
     nothing = VoxelSums.empty(1.0, np.zeros(3))
     made = Map(nothing, config=line.config, line=line).with_cloud(replace(world, sensor=None))
     guesses = [] if guess is None else [guess]
-    return made._finder(scan, scan, guesses, None, expert().maps.candidates, clock)[0]
+    found = made._finder(scan, scan, guesses, None, expert().maps.candidates, clock)[0]
+    return None if found is None else replace(found, decision=made._told(found.decision, scan, clock))

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.geometry.se3 import inverse, make_transform
 from geomoe3d.multiway.cycles import closes, find_triangles, propagate, with_cycles
-from geomoe3d.multiway.grouping import Growth, reconsidered
+from geomoe3d.multiway.grouping import Growth
 from geomoe3d.multiway.rules import Group
+from geomoe3d.multiway.second_thoughts import reconsidered
 from geomoe3d.multiway.settling import connected_parts, is_kept, settle
 
 
@@ -128,6 +129,39 @@ def test_free_space_finds_the_right_motion_though_it_is_the_quietest():
     (group,) = grown(shapes, [*wrong, right], start, witness)
     assert largest_error(group.poses, truth) < 1e-6
     assert len(grown(shapes, [*wrong, right], start)) == 2  # no scan is asked
+
+
+def test_groups_bend_where_two_edges_far_apart_agree_but_for_drift():
+    shapes, _, _, rng = graph(count=20)
+    truth = {k: make_transform(np.eye(3), np.array([0.5 * k, 0.0, 0.0])) for k in range(20)}
+    stretched = {k: make_transform(np.eye(3), np.array([0.535 * (k - 10), 0.0, 0.0])) for k in range(10, 20)}
+    start = []
+    for poses in ({k: truth[k] for k in range(10)}, stretched):
+        chain = [(k, k - 1) for k in poses if k - 1 in poses]
+        held = [edge(j, i, inverse(poses[i]) @ poses[j], 0.99, rng) for j, i in chain]
+        start.append(Group(dict(poses), held))
+    sure, weak = (
+        edge(j, i, inverse(truth[i]) @ truth[j], c, rng) for j, i, c in ((10, 0, 0.986), (19, 9, 0.75))
+    )
+    wrong = [edge(k, 19 - k, anywhere(rng), 0.9, rng) for k in (12, 15)]
+    asked = []
+
+    def witness(a, b, T):
+        asked.append(T)
+        away = (
+            max(abs(b[j][0, 3] - a[i][0, 3] - 0.5 * (j - i)) for j, i in ((10, 0), (19, 9)))
+            if T is None
+            else 9
+        )
+        return np.eye(4) if T is None else T, 1.0 if away < 0.2 else -9.0
+
+    (group,) = grown(shapes, [*wrong, sure, weak], start, witness)
+    assert any(T is None for T in asked)
+    assert largest_error(group.poses, truth) < 0.2
+    assert weak.worth < 0 < min(e.worth for e in group.edges)  # what agrees is believed together
+    assert len(grown(shapes, [*wrong, sure], start, witness)) == 2
+    beside = edge(11, 0, inverse(truth[0]) @ truth[11], 0.75, rng)  # shares a scan: no witness of its own
+    assert len(grown(shapes, [*wrong, sure, beside], start, witness)) == 2
 
 
 def test_a_scan_with_a_rival_place_is_put_where_the_whole_model_wants_it():

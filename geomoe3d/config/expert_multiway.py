@@ -95,6 +95,13 @@ class ManyGroupsExpert(Section):
         300, "points", (10, 1_000_000), "of a scan that are asked whether another saw through them"
     )
     usual: float = constant(0.01, "share", (0, 1), "of points seen through under right transforms")
+    usual_bent: float = constant(
+        0.025,
+        "share",
+        (0, 1),
+        "the same where groups are bent to be joined",
+        "in halves of hotel_umd and lab_hj under 0.035 to 0.044 for 95 % of right joints, over 0.054 for 95 % of wrong",
+    )
     against: float = constant(
         10.0,
         "log-odds",
@@ -133,6 +140,9 @@ class ManyGroupsExpert(Section):
     )
     bent: float = constant(
         3.0, "tolerances", (1, 100), "between transforms of bent groups that are no rivals: one place"
+    )
+    bends_from: int = constant(
+        3, "scans", (2, 10_000), "of both groups that may be bent to be joined, where rigidly nothing is sure"
     )
     rival: float = constant(
         0.25, "share", (0, 1), "of the worth of the best: a transform that the scans are asked about again"

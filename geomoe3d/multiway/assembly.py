@@ -19,8 +19,9 @@ from geomoe3d.multiway.alignment import align_groups, align_scans
 from geomoe3d.multiway.cycles import with_cycles
 from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
-from geomoe3d.multiway.grouping import Growth, largest_first, reconsidered
+from geomoe3d.multiway.grouping import Growth, largest_first
 from geomoe3d.multiway.rules import Group, Poses
+from geomoe3d.multiway.second_thoughts import reconsidered
 from geomoe3d.multiway.settling import settle
 from geomoe3d.multiway.survey import PairKey, Survey, key_of
 from geomoe3d.types import FloatArray
@@ -44,21 +45,24 @@ class Assembly:
     def groups(self) -> list[Group]:
         """Groups by all edges so far; a scan that cannot be used is a group of its own."""
         self.edges = self._heard()
-        return self._grown(self.edges)
+        return self._grown()
 
-    def _grown(self, edges: list[Edge]) -> list[Group]:
-        """Groups by some edges.
+    def _grown(self) -> list[Group]:
+        """Groups by the edges as they are heard.
 
         What settling lets go may find its place among scans that are better aligned now, so groups are joined
         and settled again while that joins any.
         """
         survey = self._survey
-        told = edges, survey.shapes, survey.rules
         groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
         for turn in range(expert().many_groups.most_turns):
-            grown = Growth(groups, *told, self.witness).run()
+            grown = Growth(groups, self.edges, survey.shapes, survey.rules, self.witness).run()
             if turn and len(grown) == len(groups):
                 break
+            # Edges that bent groups together are believed more than before.
+            held = {id(edge.T_target_source): edge for group in grown for edge in group.edges}
+            self.edges = [held.get(id(edge.T_target_source), edge) for edge in self.edges]
+            told = self.edges, survey.shapes, survey.rules
             placed = [part for group in grown for part in reconsidered(group, *told, self.witness)]
             groups = [part for group in placed for part in settle(group, *told, self.align)]
         return largest_first(groups)
@@ -95,23 +99,28 @@ class Assembly:
         )
 
     def witness(
-        self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray], T_a_b: FloatArray
+        self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray], T_a_b: FloatArray | None
     ) -> tuple[FloatArray, float]:
         """What the scans say of joining two groups, see `geomoe3d.multiway.grouping.Witness`.
 
         Of two single scans nothing: registration asked them already.
         """
-        if len(a) * len(b) == 1:
+        known, free_space = expert().many_groups, self._survey.free_space
+        usual = known.usual
+        if T_a_b is None:
+            T_a_b, usual = np.eye(4), known.usual_bent
+        elif len(a) * len(b) == 1:
             return T_a_b, 0.0
-        told = told_by(*self._survey.free_space.between(a, b, T_a_b))
-        if told < expert().many_groups.hopeless:
-            return T_a_b, told
-        T_a_b = align_groups(
-            a, b, T_a_b, self._survey.surfaces, self._survey.overlaps, self._survey.voxel_size
-        )
+        else:
+            told = told_by(*free_space.between(a, b, T_a_b), usual)
+            if told < known.hopeless:
+                return T_a_b, told
+            T_a_b = align_groups(
+                a, b, T_a_b, self._survey.surfaces, self._survey.overlaps, self._survey.voxel_size
+            )
         silent = sum(self._silence(i, j, inverse(a[i]) @ T_a_b @ b[j]) for i, j in self._tried_between(a, b))
-        told = told_by(*self._survey.free_space.between(a, b, T_a_b))
-        return T_a_b, told - expert().many_groups.shared_silence * silent
+        told = told_by(*free_space.between(a, b, T_a_b), usual)
+        return T_a_b, told - known.shared_silence * silent
 
     def _tried_between(
         self, a: Mapping[int, FloatArray], b: Mapping[int, FloatArray]

@@ -71,15 +71,15 @@ class FreeSpace:
         return seen, through
 
 
-def told_by(seen: float, through: float) -> float:
+def told_by(seen: float, through: float, usual: float) -> float:
     """Log-odds that a motion between two groups is right, by what `FreeSpace.between` gives.
 
-    A hundredth of what is seen may be seen through: scans are bent and poses not exact. Between large groups the same
-    bend is seen many times over, so there the share counts: of right joints in a scene of bent scans 2 to 4 %, of wrong
-    ones 6 to 13 %.
+    The share ``usual`` of what is seen may be seen through: scans are bent and poses not exact. Between large groups
+    the same bend is seen many times over, so there the share counts: of right joints in a scene of bent scans 2 to
+    4 %, of wrong ones 6 to 13 %.
     """
     known = expert().many_groups
-    excess = (through - known.usual * seen) / max(seen / known.anew, 1.0)
+    excess = (through - usual * seen) / max(seen / known.anew, 1.0)
     if excess > 0:
         return -known.against * excess
-    return known.most_for * seen / (seen + known.half_seen) * (1 - through / max(known.usual * seen, 1e-9))
+    return known.most_for * seen / (seen + known.half_seen) * (1 - through / max(usual * seen, 1e-9))

@@ -3,7 +3,9 @@
 Two groups are joined by the motion for which most speaks: edges between them that agree add up, the best
 other motion is taken off, and so is what the scans themselves contradict, such as points of one group where
 sensors of the other saw through. The surest joint is made first. What has been joined is never torn by
-weaker edges: these are found to disagree with the poses and rejected. Cost: milliseconds per joined scan.
+weaker edges: these are found to disagree with the poses and rejected. Where nothing is sure any more, groups may
+bend: edges far apart in them agree within what a chain of scans drifts, and the scans are asked about the poses
+that the joint would bend both groups to. Cost: milliseconds per joined scan.
 """
 
 from __future__ import annotations
@@ -15,14 +17,17 @@ import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse
+from geomoe3d.multiway.bending import agree_apart, drifts
 from geomoe3d.multiway.edges import Edge, Shape, differences
 from geomoe3d.multiway.pose_graph import optimise
 from geomoe3d.multiway.rules import Group, GroupingRules, Poses
 from geomoe3d.types import BoolArray, FloatArray
 
-Witness = Callable[[Mapping[int, FloatArray], Mapping[int, FloatArray], FloatArray], tuple[FloatArray, float]]
+Witness = Callable[
+    [Mapping[int, FloatArray], Mapping[int, FloatArray], FloatArray | None], tuple[FloatArray, float]
+]
 """Asked of two groups (poses of each) and a motion T_a_b (4, 4): the motion as the surfaces have it, and the
-log-odds by which the scans speak for it (negative: against)."""
+log-odds by which the scans speak for it (negative: against). No motion: both were bent into one frame."""
 
 
 @dataclass
@@ -34,6 +39,7 @@ class Motion:
         supporters: edges that agree with it.
         voices: what they bring together.
         worth: that; once ``weighed``, without what the scans contradict.
+        bends: whether edges far apart agree with it, if both groups are bent.
         weighed: whether the scans have been asked.
     """
 
@@ -41,6 +47,7 @@ class Motion:
     supporters: list[Edge]
     voices: float
     worth: float
+    bends: bool = False
     weighed: bool = False
 
 
@@ -72,6 +79,7 @@ class Growth:
             if a != b and edge.worth > rules.least_voice:
                 self._between.setdefault((min(a, b), max(a, b)), []).append(edge)
         self._ways: dict[tuple[int, int], list[Motion]] = {}
+        self._bending = False
 
     def run(self) -> list[Group]:
         """Join while anything is sure; the groups, the largest first."""
@@ -86,12 +94,23 @@ class Growth:
                 if likely is not None:
                     self._weigh(*likely)
                     continue
-                return largest_first(self.groups.values())
+                if self._bending or self._witness is None:
+                    return largest_first(self.groups.values())
+                self._bending = True
+                self._ways = {pair: ways for pair, ways in self._ways.items() if not self._bends(*pair)}
+                continue
             a, b = -pair[0], -pair[1]
             if all(way.weighed for way in self._ways[a, b]):
                 self._join(a, b)
             else:
                 self._weigh(a, b)
+
+    def _bends(self, a: int, b: int) -> bool:
+        """Whether two groups may be bent to be joined: rigidly nothing could be, and both hold enough scans."""
+        return (
+            self._bending
+            and min(len(self.groups[k].poses) for k in (a, b)) >= expert().many_groups.bends_from
+        )
 
     def _likely(self) -> tuple[int, int] | None:
         """The surest two groups that the scans could join, and have not been asked about."""
@@ -120,32 +139,41 @@ class Growth:
         edges = sorted(self._between[a, b], key=lambda e: (-e.worth, e.source, e.target))
         worth = np.array([min(edge.worth, expert().many_groups.most_worth) for edge in edges])
         motions = np.stack([_between_groups(edge, one, other) for edge in edges])
-        agreeing = self._agreements(motions, edges, other)
+        bends = self._bends(a, b)
+        agreeing = self._agreements(motions, edges, other, drifts(one, other, edges) if bends else None)
         free = np.ones(len(edges), dtype=np.bool_)
         found: list[Motion] = []
         while len(found) < expert().many_groups.most_transforms and free.any():
             voices = np.where(agreeing & free, worth, -np.inf)
             surest = voices.max(axis=1)
             further = np.maximum(voices, 0.0).sum(axis=1) - np.maximum(surest, 0.0)
-            total = surest + self._rules.further_share * further
+            apart = np.array([agree_apart(edges, row & free, worth) for row in agreeing] if bends else [0.0])
+            total = surest + np.maximum(self._rules.further_share * further, apart)
             best = int(np.where(free[: len(total)], total, -np.inf).argmax())
             if not free[best]:
                 break
             mine = np.flatnonzero(agreeing[best] & free)
-            worth_of_all = float(total[best])
-            found.append(Motion(motions[best], [edges[k] for k in mine], worth_of_all, worth_of_all))
+            voice = float(total[best])
+            bent = bends and apart[best] > 0
+            found.append(Motion(motions[best], [edges[k] for k in mine], voice, voice, bent))
             free[mine] = False
         return found
 
-    def _agreements(self, motions: FloatArray, edges: list[Edge], b: Group) -> BoolArray:
-        """(m, n) True where motion m of the first ones moves the scan of edge n as that edge does."""
+    def _agreements(
+        self, motions: FloatArray, edges: list[Edge], b: Group, drift: FloatArray | None
+    ) -> BoolArray:
+        """(m, n) True where motion m of the first ones moves the scan of edge n as that edge does.
+
+        Tolerances grow by ``drift`` (n, n), if given.
+        """
         ends = [edge.source if edge.source in b.poses else edge.target for edge in edges]
         poses = np.stack([b.poses[scan] for scan in ends])
         rows, count = min(len(edges), expert().many_groups.most_proposals), len(edges)
         moved = (motions[:rows, None] @ poses[None]).reshape(-1, 4, 4)
         own = np.tile(motions @ poses, (rows, 1, 1))
         shift, turn = differences(moved, own, [self._shapes[scan] for scan in ends] * rows)
-        alike = (shift < self._rules.tolerance) & (turn < self._rules.turn_deg)
+        more = 1.0 if drift is None else drift[:rows].ravel()
+        alike = (shift < more * self._rules.tolerance) & (turn < more * self._rules.turn_deg)
         agreeing: BoolArray = alike.reshape(rows, count) | np.eye(rows, count, dtype=np.bool_)
         return agreeing
 
@@ -153,14 +181,18 @@ class Growth:
         """Take off every motion what the scans contradict."""
         for way in self._ways[a, b]:
             if self._witness is not None and not way.weighed:
-                one, other = (self._around(self.groups[k].poses, way.supporters) for k in (a, b))
-                way.T_a_b, told = self._witness(one, other, way.T_a_b)
+                joined = self._joined(a, b, way)[1] if way.bends else None
+                one, other = (self._around(self.groups[k].poses, way.supporters, joined) for k in (a, b))
+                T, told = self._witness(one, other, None if way.bends else way.T_a_b)
+                way.T_a_b = way.T_a_b if way.bends else T
                 way.worth += told
             way.weighed = True
         self._ways[a, b] = self._merged(self._ways[a, b], b)
 
-    def _around(self, poses: Poses, supporters: Sequence[Edge]) -> Poses:
-        """The scans of a group nearest to where some edges end in it: far away, poses have drifted."""
+    def _around(self, poses: Poses, supporters: Sequence[Edge], bent: Poses | None) -> Poses:
+        """The scans of a group nearest to where some edges end in it: far away, poses have drifted; as bent, if so."""
+        if bent is not None:
+            poses = {k: bent[k] for k in poses}
         if len(poses) <= expert().many_groups.asked:
             return poses
         centers = {k: T[:3, :3] @ self._shapes[k].center + T[:3, 3] for k, T in poses.items()}
@@ -189,14 +221,26 @@ class Growth:
         alike = (shift < bent * self._rules.tolerance) & (turn < bent * self._rules.turn_deg)
         return bool(alike.all())
 
-    def _join(self, a: int, b: int) -> None:
-        """Group b becomes part of group a; poses are optimised where there are loops to close."""
-        way, one, other = self._ways[a, b][0], self.groups[a], self.groups.pop(b)
+    def _joined(self, a: int, b: int, way: Motion) -> tuple[list[Edge], Poses]:
+        """Edges and poses of two groups as one, optimised where there are loops to close."""
+        one, other = self.groups[a], self.groups[b]
         poses = {**one.poses, **{scan: way.T_a_b @ T for scan, T in other.poses.items()}}
         edges = [*one.edges, *other.edges, *way.supporters]
         grown = len(other.poses) > 1 or _octave(len(poses)) > _octave(len(one.poses))
         if grown and len(edges) >= len(poses):
             poses = optimise(poses, edges, self._rules.tolerance, library=self._rules.optimizer)
+        return edges, poses
+
+    def _join(self, a: int, b: int) -> None:
+        """Group b becomes part of group a."""
+        way = self._ways[a, b][0]
+        if way.bends:  # what agrees is believed together
+            believed = [
+                replace(e, evidence=e.evidence + max(way.worth - e.worth, 0.0)) for e in way.supporters
+            ]
+            way = replace(way, supporters=believed)
+        edges, poses = self._joined(a, b, way)
+        self.groups.pop(b)
         self.groups[a] = Group(poses, edges)
         crossing, self._between = self._between, {}
         for pair, some in crossing.items():
@@ -204,47 +248,6 @@ class Growth:
             if c != d:
                 self._between.setdefault((c, d), []).extend(some)
         self._ways = {pair: ways for pair, ways in self._ways.items() if not {a, b} & set(pair)}
-
-
-def reconsidered(
-    group: Group,
-    edges: Sequence[Edge],
-    shapes: Sequence[Shape],
-    rules: GroupingRules,
-    witness: Witness,
-) -> list[Group]:
-    """The group with every scan that has a rival place put where most speaks for it now, or let go.
-
-    A scan that joined early was weighed against few others; now the whole model can be asked.
-
-    Args:
-        group: from `Growth`.
-        edges, shapes, rules, witness: as `Growth` takes them.
-
-    Returns:
-        The group, and scans by themselves for which no place leads clearly enough.
-    """
-    released: list[Group] = []
-    edges = [replace(e, evidence=0.0) for e in edges]  # what triangles say is what the model says
-    for scan in sorted(group.poses) if len(group.poses) > 2 else ():
-        rest = {k: T for k, T in group.poses.items() if k != scan}
-        mine = [
-            e for e in edges if scan in (e.source, e.target) and {e.source, e.target} <= group.poses.keys()
-        ]
-        ways = Growth([Group(rest), Group({scan: np.eye(4)})], mine, shapes, rules, witness).rivals()
-        if len(ways) < 2:
-            continue
-        found = ways[0].T_a_b if min(rest) < scan else inverse(ways[0].T_a_b)
-        shift, turn = differences(group.poses[scan][None], found[None], [shapes[scan]])
-        if shift[0] < 2 * rules.tolerance and turn[0] < 2 * rules.turn_deg:
-            continue
-        others = [e for e in group.edges if scan not in (e.source, e.target)]
-        if lead(ways) >= rules.joined_worth:
-            group = Group({**rest, scan: found}, [*others, *ways[0].supporters])
-        else:
-            group = Group(rest, others)
-            released.append(Group({scan: np.eye(4)}))
-    return [group, *released]
 
 
 def lead(ways: Sequence[Motion]) -> float:

@@ -150,6 +150,7 @@ def test_a_scan_is_added_by_its_pose_with_what_its_sensor_saw(rooms):
     expected = true[:3, 3] - made._voxels.origin - made._voxels.points
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     assert np.median(np.einsum("ij,ij->i", towards, expected)) > 0.999
+    np.testing.assert_allclose(made._voxels.sensors + made._voxels.origin, true[None, :3, 3])
 
 
 # ---- what cannot be ------------------------------------------------------------------------------------

@@ -9,15 +9,17 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.features.base import with_features
 from geomoe3d.features.learned import LearnedDescriptor
 from geomoe3d.features.multiscale import MultiscaleDescriptor
 from geomoe3d.features.pyramid import pyramid
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.maps.facing import both_sides, facing_alike
-from geomoe3d.maps.level import Compared
+from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.locate import Search
 from geomoe3d.maps.places import Query, Window
+from geomoe3d.maps.sight import Sight, seen_through
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.types import PreparedCloud
 
@@ -49,7 +51,9 @@ def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
         [[0, 0, 0], [50, 0, 0]], 100, axis=0
     )
     up = np.tile([0.0, 0.0, 1.0], (200, 1))
-    level = SimpleNamespace(voxel_size=0.1, points=ends, normals=up, tree=cKDTree(ends))
+    level = SimpleNamespace(
+        voxel_size=0.1, points=ends, normals=up, tree=cKDTree(ends), sensors=np.zeros((0, 3))
+    )
     scan = SimpleNamespace(points=ends, normals=up)
     search = SimpleNamespace(
         level=level,
@@ -63,6 +67,26 @@ def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
     assert Search._quick(search, np.eye(4)) == 0.0
     search._view = None
     assert Search._quick(search, np.eye(4)) == 1.0
+
+
+def test_where_a_sensor_of_the_map_saw_through_no_surface_stands():
+    """A wall at x = 3, its sensor at the origin: only what stands before it is seen through."""
+    grid = np.stack(np.meshgrid([3.0], np.arange(-2, 2, 0.1), np.arange(-1, 1, 0.1)), -1).reshape(-1, 3)
+    from_origin = (
+        VoxelSums.empty(0.1, np.zeros(3)).added(grid, np.zeros(3)).added(grid + 0.01, np.full(3, 0.01))
+    )
+    assert len(from_origin.sensors) == 1
+    level = Level.of(from_origin, 0.1, PreparationConfig())
+    patch = np.random.default_rng(3).uniform(-0.3, 0.3, (50, 3)) * (0.1, 1, 1)
+    for x, y, expected in ((1.5, 0, 1.0), (3.0, 0, 0.0), (5.0, 0, 0.0), (1.5, 8, 0.0)):
+        placed = patch + np.array([x, y, 0])
+        assert seen_through(level, placed).mean() == expected
+    place = make_transform(np.eye(3), np.array([1.5, 0, 0]))
+    assert Sight(level, patch).factor(place) == pytest.approx(np.exp(-expert().surfaces.violation_weight))
+    place[0, 3] = 3.0
+    assert Sight(level, patch).factor(place) == 1.0
+    unknown = Level.of(VoxelSums.empty(0.1, np.zeros(3)).added(grid), 0.1, PreparationConfig())
+    assert not seen_through(unknown, patch + np.array([1.5, 0, 0])).any()
 
 
 def test_voxels_are_those_of_the_whole_in_whatever_pieces():

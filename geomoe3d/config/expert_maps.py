@@ -177,6 +177,12 @@ class LocatingExpert(Section):
     )
     asked: int = constant(400, "points", (10, 1_000_000), "of the scan, in a quick look")
     asked_back: int = constant(800, "points", (10, 1_000_000), "of the map, in a quick look")
+    seen_through: float = constant(
+        4.0, "voxels", (0, 1000), "in front of what a sensor saw, from which on it saw through"
+    )
+    asked_sensors: int = constant(
+        4, "sensors", (0, 10_000), "of a map, those nearest to where a scan would lie"
+    )
     close: float = constant(
         0.75, "share", (0, 1), "of the best candidate's quick score: such places are looked at too"
     )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.clouds.prepare import drop_isolated, estimate_normals, orient_normals, voxel_means
+from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.features.base import Descriptor, with_features
@@ -58,6 +59,7 @@ class Level:
         features: (c, 65) float32 of these, by `LearnedDescriptor`.
         twins: (m,) which of these have no known side.
         twin_features: (m, 65) of the twins, seen from the other side.
+        sensors: (S, 3) of the map, as far as they are known.
     """
 
     voxel_size: float
@@ -68,6 +70,7 @@ class Level:
     features: Float32Array
     twins: IntArray
     twin_features: Float32Array
+    sensors: FloatArray
 
     @classmethod
     def of(cls, voxels: VoxelSums, voxel_size: float, config: PreparationConfig, name: str = "map") -> Level:
@@ -99,9 +102,10 @@ class Level:
         turned = tuple(
             replace(grid, normals=-grid.normals, features=both_sides(grid.features)) for grid in grids
         )
-        features, seen_behind = describe.at(grids, rows), describe.at(turned, rows[twins])
+        features = describe.at(grids, rows)
+        seen_behind = describe.at(turned, rows[twins]) if len(twins) else features[:0]
         fpfh = grids[0].features.astype(np.float16)
-        return cls(voxel_size, points, normals, fpfh, rows, features, twins, seen_behind)
+        return cls(voxel_size, points, normals, fpfh, rows, features, twins, seen_behind, voxels.sensors)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -109,6 +113,16 @@ class Level:
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points)
+
+    def range_image(self, number: int) -> RangeImage:
+        """What one of the sensors saw; made once."""
+        if number not in self._range_images:
+            self._range_images[number] = RangeImage.of(self.points, self.sensors[number])
+        return self._range_images[number]
+
+    @cached_property
+    def _range_images(self) -> dict[int, RangeImage]:
+        return {}
 
     def seen_from(
         self, eye: FloatArray, rows: IntArray, part: PreparedCloud, describe: Descriptor, anew: bool

@@ -26,6 +26,7 @@ from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.places import Query, Window
+from geomoe3d.maps.sight import Sight, seen_factor
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
@@ -185,9 +186,10 @@ class Search:
             self._clock("match")
             pair = self._line.match((self.scan, target), None, self._clock)
             _, proposed = self._line.propose(pair, self._clock)
-            selection = Selection(
-                pair, self._line.scorers, self._line.refiner.about(pair), self.config, self._clock
-            )
+            scorers = dict(self._line.scorers)
+            if scorers and len(self.level.sensors):
+                scorers["sight"] = Sight(self.level, self.scan.points[self._rows[::4]])
+            selection = Selection(pair, scorers, self._line.refiner.about(pair), self.config, self._clock)
             selection.add([Hypothesis(T), *proposed])
             return Found(pair, selection.decide())
 
@@ -259,7 +261,8 @@ class Search:
 
     def _quick(self, T: FloatArray, least: float = 0.0) -> float:
         """Share of the scan's points that lie on the map with an agreeing plane, times exp(-10 v), v the share of map
-        points that stand where the scan's sensor looked through; that is not asked where the first is below ``least``.
+        points that stand where the scan's sensor looked through, and the same of the scan and the map's sensors; that
+        is not asked where the first is below ``least``.
         """
         level, voxel = self.level, self.level.voxel_size
         moved = transform_points(T, self.scan.points[self._rows])
@@ -268,6 +271,8 @@ class Search:
         normals = self.scan.normals[self._rows][hit] @ T[:3, :3].T
         cosine = np.abs(np.einsum("ij,ij->i", normals, level.normals[np.asarray(nearest)[hit]]))
         agreement = float((cosine > expert().surfaces.least_cosine).sum() / len(moved))
+        if agreement > least:
+            agreement *= seen_factor(level, moved[~hit], len(moved))
         if self._view is None or agreement <= least:
             return agreement
         near = level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach)
@@ -276,7 +281,10 @@ class Search:
         if not len(around):
             return 0.0
         margin, _ = self._view.margins(transform_points(inverse(T), level.points[around]))
-        violation = float((margin < -4 * voxel).sum() / (np.isfinite(margin).sum() + 0.05 * len(around)))
+        violation = float(
+            (margin < -expert().locating.seen_through * voxel).sum()
+            / (np.isfinite(margin).sum() + 0.05 * len(around))
+        )
         return agreement * float(np.exp(-expert().surfaces.violation_weight * violation))
 
     def _around(self, T: FloatArray, fully: bool) -> PreparedCloud:

@@ -299,7 +299,8 @@ class Map:
         return Finder(self._line, self._voxels, self._level, self.name)
 
     @cached_property
-    def _extent(self) -> float:
+    def extent(self) -> float:
+        """Diagonal of the box that holds the central 98 % of it along each axis, cloud units."""
         return robust_extent(self._voxels.points)
 
     def _level(self, size: float, coarsest: float, most: int) -> Level:
@@ -325,16 +326,16 @@ class Map:
     def _check_added(self, name: str, extent: float) -> None:
         """Refuse a further cloud that would ruin the map."""
         most = expert().preparation.most_extent_ratio
-        if extent > most * self._extent or extent < 5 * self._voxels.edge:
+        if extent > most * self.extent or extent < 5 * self._voxels.edge:
             raise InputError(
-                f"'{name}' has an extent of {extent:.4g}, the map one of {self._extent:.4g} on voxels of "
+                f"'{name}' has an extent of {extent:.4g}, the map one of {self.extent:.4g} on voxels of "
                 f"{self._voxels.edge:.4g}: at most {most} times the map's extent and at least 5 of its voxels can be "
                 "added; bring both to one unit, or index the larger cloud first"
             )
 
     def _refused(self, cloud: PointCloud) -> str | None:
         """A sentence where scan and map cannot belong together."""
-        extents = robust_extent(cloud.points), self._extent
+        extents = robust_extent(cloud.points), self.extent
         if extents[0] > expert().maps.largest_scan * extents[1]:
             return (
                 f"the scan is larger than the map (extents {extents[0]:.4g} and {extents[1]:.4g}): give them the other "

@@ -25,9 +25,9 @@ from geomoe3d.maps.level import Level
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.runtime.files import write_atomically
 
-VERSION = 2
-_LEVEL = tuple(field.name for field in fields(Level) if field.name != "voxel_size")
-_VOXELS = ("origin", "keys", "sums", "counts", "towards")
+VERSION = 3
+_LEVEL = tuple(field.name for field in fields(Level) if field.name not in ("voxel_size", "sensors"))
+_VOXELS = ("origin", "keys", "sums", "counts", "towards", "sensors")
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,13 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, t
                     f"is {VERSION}); update geomoe3d, or index the map again"
                 )
             arrays = {name: archive[name] for name in archive.files if name != "told"}
-            voxels = VoxelSums(float(told["edge"]), *(arrays[name] for name in _VOXELS))
+            voxels = VoxelSums(float(told["edge"]), *(arrays[name] for name in _VOXELS if name in arrays))
             levels = tuple(
-                Level(float(size), **{name: arrays[f"level{number}_{name}"] for name in _LEVEL})
+                Level(
+                    float(size),
+                    **{name: arrays[f"level{number}_{name}"] for name in _LEVEL},
+                    sensors=voxels.sensors,
+                )
                 for number, size in enumerate(told["levels"])
                 if told.get("descriptor") == _descriptor()
             )

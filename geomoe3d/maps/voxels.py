@@ -7,7 +7,7 @@ whole. 64 bytes per voxel; a million points take some 0.3 s.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ class VoxelSums:
         counts: (M,) points.
         towards: (M, 3) sums of the unit directions from the points to the sensors that saw them; zero where none
             is known.
+        sensors: (S, 3) where they stood, local coordinates; those within a voxel of another are left out.
     """
 
     edge: float
@@ -39,6 +40,7 @@ class VoxelSums:
     sums: FloatArray
     counts: IntArray
     towards: FloatArray
+    sensors: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def empty(cls, edge: float, origin: FloatArray) -> VoxelSums:
@@ -68,13 +70,16 @@ class VoxelSums:
             InputError: the map spans more than 2^21 voxels along an axis.
         """
         local = points - self.origin
-        towards = np.zeros_like(local)
+        towards, sensors = np.zeros_like(local), self.sensors
         if sensor is not None:
-            towards = (sensor - self.origin) - local
+            place = sensor - self.origin
+            towards = place - local
             towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+            if not (np.linalg.norm(sensors - place, axis=1) < self.edge).any():
+                sensors = np.concatenate([sensors, place[None]])
         ones = np.ones(len(local), dtype=np.int64)
         fresh = _summed(self._keys(local), local, ones, towards)
-        return self._of(*_joined(self._columns(), fresh))
+        return replace(self._of(*_joined(self._columns(), fresh)), sensors=sensors)
 
     def coarser(self, factor: int = 2) -> VoxelSums:
         """On a grid so many times as wide; the same as if it had been so wide from the start."""
@@ -121,7 +126,8 @@ class VoxelSums:
         towards: FloatArray,
         edge: float | None = None,
     ) -> VoxelSums:
-        return VoxelSums(self.edge if edge is None else edge, self.origin, keys, sums, counts, towards)
+        edge = self.edge if edge is None else edge
+        return VoxelSums(edge, self.origin, keys, sums, counts, towards, self.sensors)
 
 
 def _packed(cells: IntArray) -> IntArray:

@@ -50,6 +50,12 @@ KINDS = {
 }
 """What the constants are that decide no answer of a registration: kind -> patterns ``file:name``, asked in order."""
 
+DECIDING = {
+    *("clouds", "features", "matching", "filters", "estimators", "scoring"),
+    *("refinement", "decision", "geometry", "maps", "multiway"),
+}
+"""Folders in which a number is likely to decide an answer; those of networks go with their weights."""
+
 DECIDES = "that decide an answer"
 
 
@@ -78,6 +84,15 @@ def main(most: int, list_constants: bool) -> None:
         click.echo(f"{len(found):11,}  {kind}")
         for place in found if list_constants else ():
             click.echo(f"             {place}")
+    inside = [
+        f"{path.relative_to(PACKAGE).as_posix()}:{line} {number}"
+        for path, tree in trees.items()
+        if path.parent.relative_to(PACKAGE).as_posix() in DECIDING
+        for number, line in numbers_inside(tree)
+    ]
+    click.echo(f"{len(inside):7,}  decimal numbers inside functions that may decide an answer")
+    for place in inside if list_constants else ():
+        click.echo(f"             {place}")
     circles = import_circles(trees)
     click.echo(f"{len(circles):7,}  import circles between files")
     for circle in circles:
@@ -90,12 +105,31 @@ def constants_by_kind(trees: dict[Path, ast.Module]) -> dict[str, list[str]]:
     """``file:line name`` of every constant outside the configuration, by the kinds of `KINDS` and by `DECIDES`."""
     by_kind: dict[str, list[str]] = {DECIDES: [], **{kind: [] for kind in KINDS}}
     for path, tree in trees.items():
-        if path.name == "config.py" or path.parent.name == "config":
+        if is_configuration(path):
             continue
         file = path.relative_to(PACKAGE).as_posix()
         for name, line in constants(tree):
             by_kind[kind_of(f"{file}:{name}")].append(f"{file}:{line} {name}")
     return by_kind
+
+
+def is_configuration(path: Path) -> bool:
+    """Whether a file holds the configuration, whose numbers are those that belong there."""
+    return path.name == "config.py" or path.parent.name == "config"
+
+
+def numbers_inside(tree: ast.Module) -> Iterator[tuple[float, int]]:
+    """Value and line of the decimal numbers written in the bodies of functions: whether one decides has to be read.
+
+    Whole ones, a half, and what only avoids 0 / 0 (up to 1e-5) are left out: formulas are full of them.
+    """
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef):
+            for node in (node for statement in function.body for node in ast.walk(statement)):
+                if isinstance(node, ast.Constant) and isinstance(node.value, float):
+                    value = node.value
+                    if value > 1e-5 and value != 0.5 and not value.is_integer():
+                        yield value, node.lineno
 
 
 def kind_of(constant: str) -> str:

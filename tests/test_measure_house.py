@@ -56,3 +56,8 @@ def test_what_decides_an_answer_stands_in_the_configuration(house):
     found = house.constants_by_kind(trees)
     assert found[house.DECIDES] == []
     assert {kind for kind, places in found.items() if places} == set(house.KINDS)
+
+
+def test_numbers_inside_functions_are_seen_but_for_those_that_formulas_are_full_of(house):
+    text = "A = 0.3\ndef f(x=0.2):\n    return 0.7 * x + 3 + 64 + 1e-9 + 0.5\ndef g():\n    return 3.5, 2.0\n"
+    assert list(house.numbers_inside(ast.parse(text))) == [(0.7, 3), (3.5, 5)]

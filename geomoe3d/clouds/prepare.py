@@ -134,8 +134,9 @@ def check_cloud(cloud: PointCloud) -> None:
 
 def robust_extent(points: FloatArray) -> float:
     """Diagonal of the box that holds the central 98 % along each axis: stray points do not count."""
-    sample = points[:: max(1, len(points) // expert().preparation.extent_sample)]
-    low, high = np.percentile(sample, [1, 99], axis=0)
+    known = expert().preparation
+    sample = points[:: max(1, len(points) // known.extent_sample)]
+    low, high = np.percentile(sample, [known.outside_extent, 100 - known.outside_extent], axis=0)
     extent = float(np.linalg.norm(high - low))
     return extent if extent > 0 else float(np.linalg.norm(extents(points)))
 
@@ -149,7 +150,7 @@ def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float
     for cloud in (source, target):
         while (occupied := _num_different(voxel_keys(cloud.points, voxel_size, OFF_ROUND))) > max_points:
             # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
-            voxel_size *= 1.02 * float(np.sqrt(occupied / max_points))
+            voxel_size *= expert().preparation.coarsening * float(np.sqrt(occupied / max_points))
     return voxel_size
 
 
@@ -238,19 +239,20 @@ def typical_spacing(points: FloatArray) -> float:
     import small_gicp
 
     # All points of a part keep their density; a thinned cloud would look sparser than it is.
-    middle = np.median(points[:: max(1, len(points) // 20_000)], axis=0)
+    known = expert().preparation
+    middle = np.median(points[:: max(1, len(points) // known.middle_sample)], axis=0)
     away: FloatArray = np.zeros(len(points))
     for rows in in_cache(len(points)):
         for column, at in zip(points[rows].T, middle, strict=True):
             np.maximum(away[rows], np.abs(column - at), out=away[rows])
-    sample = expert().preparation.spacing_sample
+    sample = known.spacing_sample
     if len(points) > sample:
         away_limit = np.partition(away, sample)[sample]
         central = np.flatnonzero(away <= away_limit)
-        asked = mixed(central.astype(np.uint64)) % np.uint64(sample // 2000) == 0
+        asked = mixed(central.astype(np.uint64)) % np.uint64(sample // known.spacing_asked) == 0
         points, queries = points[central], points[central[asked]]
     else:
-        queries = points[:: max(1, len(points) // 2000)]
+        queries = points[:: max(1, len(points) // known.spacing_asked)]
     tree = small_gicp.KdTree(small_gicp.PointCloud(points), num_threads=1)
     nearest = np.sqrt(np.sort(tree.batch_knn_search(queries, 2)[1][:, 1]))
     quarter = len(nearest) // 4

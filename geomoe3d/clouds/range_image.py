@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.types import FloatArray, IntArray
 
 
@@ -29,9 +30,9 @@ class RangeImage:
     nearest: FloatArray
 
     @classmethod
-    def of(cls, points: FloatArray, viewpoint: FloatArray, pixel_deg: float = 2.5) -> RangeImage:
-        """The range image of points (N, 3) seen from ``viewpoint`` (3,), same frame."""
-        columns = round(360 / pixel_deg)
+    def of(cls, points: FloatArray, viewpoint: FloatArray, pixel_deg: float | None = None) -> RangeImage:
+        """The range image of points (N, 3) seen from ``viewpoint`` (3,), same frame; None: as surfaces are asked."""
+        columns = round(360 / (pixel_deg or expert().surfaces.pixel_deg))
         shape = (columns // 2, columns)
         axes = _viewing_axes(points - viewpoint)
         pixel, distance = _pixels(points, viewpoint, axes, shape)

@@ -50,5 +50,6 @@ def fits_single_precision(points: FloatArray) -> bool:
 
 
 def _median_and_spread(points: FloatArray) -> tuple[FloatArray, float]:
-    low, median, high = np.array([np.percentile(points[:, k], (5, 50, 95)) for k in range(3)]).T
+    tail = expert().loading.outside_spread
+    low, median, high = np.array([np.percentile(points[:, k], (tail, 50, 100 - tail)) for k in range(3)]).T
     return median, float(np.max(high - low))

@@ -161,11 +161,13 @@ def _sensor_may_be_at_origin(cloud: PointCloud) -> bool:
 
 def sign_breaks(cloud: PreparedCloud) -> float:
     """Share of neighbours on one smooth surface whose normals are turned to opposite sides, in [0, 1]."""
-    distance, near = cloud.tree.query(cloud.points, k=7)
-    rows, others = np.repeat(np.arange(len(cloud.points)), 6), np.asarray(near)[:, 1:].ravel()
-    close = np.asarray(distance)[:, 1:].ravel() < 2.5 * cloud.voxel_size
+    known = expert().viewpoint
+    distance, near = cloud.tree.query(cloud.points, k=known.sign_neighbors + 1)
+    rows = np.repeat(np.arange(len(cloud.points)), known.sign_neighbors)
+    others = np.asarray(near)[:, 1:].ravel()
+    close = np.asarray(distance)[:, 1:].ravel() < known.sign_reach * cloud.voxel_size
     cosine = np.einsum("ij,ij->i", cloud.normals[rows[close]], cloud.normals[others[close]])
-    smooth = np.abs(cosine) > 0.9
+    smooth = np.abs(cosine) > known.smooth_cosine
     return float((cosine[smooth] < 0).mean()) if smooth.any() else 0.0
 
 
@@ -191,18 +193,18 @@ def guess_viewpoint(
     points, normals = points[chosen], normals[chosen]
     low, high = bounds(points)
     half = (high - low) / 2
-    step = 0.15 * float(np.linalg.norm(half))
-    places = (low + high) / 2 + rng.uniform(-1, 1, (known.num_candidates, 3)) * (1.3 * half + step)
+    step = known.first_step * float(np.linalg.norm(half))
+    places = (low + high) / 2 + rng.uniform(-1, 1, (known.num_candidates, 3)) * (known.reach * half + step)
     scores = np.array([_plausibility(place, points, normals, margin) for place in places])
     order = np.argsort(-scores, kind="stable")[: known.num_kept]
     best, best_scores = places[order], scores[order]
-    for _ in range(4):
+    for _ in range(known.rounds):
         for k in range(len(best)):
-            for trial in best[k] + rng.normal(0, step, (8, 3)):
+            for trial in best[k] + rng.normal(0, step, (known.trials, 3)):
                 score = _plausibility(trial, points, normals, margin)
                 if score > best_scores[k]:
                     best[k], best_scores[k] = trial, score
-        step /= 1.7
+        step /= known.narrowing
     found: FloatArray = best[best_scores.argmax()]
     directions, distance, _ = _view(found, points, normals)
     visible = _not_hidden(directions, distance, margin).mean()

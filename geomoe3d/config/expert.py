@@ -29,6 +29,7 @@ from geomoe3d.config.expert_decision import (
 from geomoe3d.config.expert_maps import LocatingExpert, MapsExpert, PlacesExpert
 from geomoe3d.config.expert_multiway import ManyGroupsExpert, ManyPairsExpert, ManyPosesExpert
 from geomoe3d.config.expert_proposing import (
+    ConsensusExpert,
     CorrespondencesExpert,
     FeaturesExpert,
     KeypointAlignmentExpert,
@@ -63,6 +64,7 @@ class ExpertConfig(Section):
     remarks: RemarksExpert = RemarksExpert()
     features: FeaturesExpert = FeaturesExpert()
     keypoints: KeypointsExpert = KeypointsExpert()
+    consensus: ConsensusExpert = ConsensusExpert()
     surroundings: SurroundingsExpert = SurroundingsExpert()
     keypoint_alignment: KeypointAlignmentExpert = KeypointAlignmentExpert()
     ransac: RansacExpert = RansacExpert()

@@ -21,6 +21,9 @@ class LoadingExpert(Section):
     near_zero: float = constant(
         10.0, "spreads", (0.1, 1000), "of a cloud within which its median lies near zero"
     )
+    outside_spread: float = constant(
+        5.0, "percent", (0, 49), "of the points at either end of an axis, see there"
+    )
 
 
 class PreparationExpert(Section):
@@ -32,8 +35,19 @@ class PreparationExpert(Section):
         (100, 100_000_000),
         "looked at when a voxel size is chosen: density is known well enough by then",
     )
+    outside_extent: float = constant(
+        1.0,
+        "percent",
+        (0, 49),
+        "of the points at either end of an axis that are strays and not of the extent",
+    )
+    middle_sample: int = constant(20_000, "points", (100, 100_000_000), "that the middle is found by")
+    spacing_asked: int = constant(2000, "points", (10, 2000), "whose spacing is measured")
     spacing_sample: int = constant(
         8000, "points", (2000, 100_000_000), "nearest to the middle, of which the spacing is measured"
+    )
+    coarsening: float = constant(
+        1.02, "ratio", (1, 10), "beyond what surfaces need by which voxels grow until they are few enough"
     )
     most_extent_ratio: int = constant(
         50, "ratio", (2, 1_000_000), "of two clouds' extents; beyond it one is in another unit"
@@ -79,7 +93,21 @@ class ViewpointExpert(Section):
         "of neighbours on a smooth surface that are turned to opposite sides",
         "scans 0.1 to 2.5 %, objects 1.5 to 4.6 %, and 3 % in one cloud of any pair of them",
     )
+    sign_neighbors: int = constant(6, "points", (1, 1000), "nearest ones that a sign is held against")
+    sign_reach: float = constant(2.5, "voxels", (0.1, 100), "within which they lie on one surface")
+    smooth_cosine: float = constant(
+        0.9, "cosine", (0, 1), "from which on two normals are of one smooth surface"
+    )
     pixel_deg: float = constant(3.0, "degrees", (0.1, 45), "pixels in which visibility is asked")
+    first_step: float = constant(
+        0.15, "half diagonals", (0, 10), "by which the best places are moved at first"
+    )
+    reach: float = constant(
+        1.3, "half extents", (0, 100), "from the middle, and a step, within which places are tried"
+    )
+    rounds: int = constant(4, "rounds", (0, 1000), "of improvement")
+    trials: int = constant(8, "places", (1, 1000), "around each kept one in a round")
+    narrowing: float = constant(1.7, "ratio", (1, 100), "of the steps of one round to those of the next")
     num_candidates: int = constant(200, "places", (1, 100_000), "tried for a sensor that is not known")
     num_kept: int = constant(4, "places", (1, 1000), "that are improved")
     num_points: int = constant(1500, "points", (10, 1_000_000), "whose visibility is asked")

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import Field
+
 from geomoe3d.config.section import Section, constant
 
 
@@ -116,3 +120,39 @@ class RansacExpert(Section):
     """RANSAC (`estimators/ransac.py`)."""
 
     most_refits: int = constant(50, "fits", (0, 10_000), "of the best sample to those that agree with it")
+
+
+class ConsensusExpert(Section):
+    """Consensus, beside the settings of `estimators/consensus.py`."""
+
+    score_sigma: float = constant(
+        0.75,
+        "inlier thresholds",
+        (0.01, 100),
+        "of the residuals that count in the score of a transform",
+        "somewhat narrower than the threshold told right from wrong better than a count or a truncated square",
+    )
+    last_refits: int = constant(
+        10, "fits", (0, 1000), "at most, of the transforms that are carried to the end"
+    )
+    least_spread: float = constant(
+        0.05,
+        "inlier thresholds",
+        (0, 100),
+        "across the line through the inliers; thinner ones, also of RANSAC, leave the turn about it to the noise",
+    )
+    less_effort: tuple[Annotated[int, Field(ge=1, le=100_000)], Annotated[int, Field(ge=1, le=100_000)]] = (
+        constant(
+            (500, 60), "seeds, transforms", None, "that propose and are refined where others draw them closer"
+        )
+    )
+    least_effort: tuple[
+        Annotated[int, Field(ge=1, le=100_000)],
+        Annotated[int, Field(ge=1, le=100_000)],
+        Annotated[int, Field(ge=1, le=100_000)],
+    ] = constant(
+        (150, 15, 3),
+        "seeds, transforms",
+        None,
+        "the same, and those returned, where only whether there is one is asked",
+    )

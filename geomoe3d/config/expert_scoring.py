@@ -8,6 +8,7 @@ from geomoe3d.config.section import Section, constant
 class SurfacesExpert(Section):
     """What the clouds say of a hypothesis (`scoring/surfaces.py`)."""
 
+    pixel_deg: float = constant(2.5, "degrees", (0.1, 45), "pixels of what a sensor saw")
     num_random: int = constant(
         256, "features", (16, 100_000), "of the target, at random, per source point: p-values down to 1 / 257"
     )

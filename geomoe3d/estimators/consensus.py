@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.config import EstimatorConfig
+from geomoe3d.config import EstimatorConfig, expert
 from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.estimators.compatibility import (
     BLOCK,
@@ -101,11 +101,13 @@ class ConsensusEstimator(Estimator):
 
     def with_less_effort(self) -> Self:
         """Fewer seeds, and fewer proposals refined: what is drawn closer need not be proposed so well."""
-        return replace(self, num_seeds=500, num_refined=60)
+        num_seeds, num_refined = expert().consensus.less_effort
+        return replace(self, num_seeds=num_seeds, num_refined=num_refined)
 
     def with_least_effort(self) -> Self:
         """See `Estimator`."""
-        return replace(self, num_hypotheses=3, num_seeds=150, num_refined=15)
+        num_seeds, num_refined, num_returned = expert().consensus.least_effort
+        return replace(self, num_hypotheses=num_returned, num_seeds=num_seeds, num_refined=num_refined)
 
     @single_blas_thread()
     def __call__(
@@ -139,7 +141,7 @@ class ConsensusEstimator(Estimator):
         # Refits bring some together, and some are not firm: half as many again are carried to the end.
         some = self.num_hypotheses + self.num_hypotheses // 2
         most = some if settled else max(self.num_refined, some)
-        for limit, refits in ((most, self.num_refits), (some, 10)):
+        for limit, refits in ((most, self.num_refits), (some, expert().consensus.last_refits)):
             keep = self._distinct_rows(R, t, scores, limit)
             R, t = R[keep], t[keep]
             R, t = self._refitted(R, t, known, vote, refits)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.rigid_fit import fit_rigid_shared, spread_shared, squared_residuals_shared
 from geomoe3d.geometry.se3 import make_transform
@@ -23,18 +24,17 @@ def score(
     vote: Float32Array,
     surroundings: Surroundings | None = None,
 ) -> FloatArray:
-    """Sum of vote x exp(-r^2 / (2 0.75^2)) over all correspondences for each motion, (K,).
+    """Sum of vote x exp(-r^2 / (2 s^2)) over all correspondences for each motion, (K,).
 
-    Residuals r in units of the inlier threshold; with surroundings each term is weighed by how well the
-    normals meet. A smooth kernel, somewhat narrower than the threshold, told right from wrong better than a
-    count or a truncated square.
+    Residuals r and s, `expert.consensus.score_sigma`, in inlier thresholds; with surroundings each term is weighed by
+    how well the normals meet.
     """
     scores = np.empty(len(R))
     step = max(1, _SCORED_AT_ONCE // max(len(known), 1))
     for start in range(0, len(R), step):
         part = slice(start, start + step)
         kernel = squared_residuals_shared(R[part], t[part], known).astype(np.float32)
-        kernel *= np.float32(-0.5 / 0.75**2)
+        kernel *= np.float32(-0.5 / expert().consensus.score_sigma ** 2)
         np.exp(kernel, out=kernel)
         if surroundings is not None:
             kernel *= surroundings.matched(R[part])
@@ -73,9 +73,9 @@ def finished(
     """
     r2 = squared_residuals_shared(R, t, known)
     weights = vote * (r2 < 1) / (1 + r2)
-    # A set thinner than a twentieth of the threshold leaves the turn about its line to the noise.
+    # A thin set leaves the turn about its line to the noise.
     thinnest = np.minimum(spread_shared(unit[:, :3], weights), spread_shared(unit[:, 3:], weights))
-    firm = ((weights > 0).sum(1) >= 3) & (thinnest >= 0.05)
+    firm = ((weights > 0).sum(1) >= 3) & (thinnest >= expert().consensus.least_spread)
     if not firm.any():
         return []
     R, t = fit_rigid_shared(known, weights[firm])

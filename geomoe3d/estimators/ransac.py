@@ -86,7 +86,8 @@ class RansacEstimator(Estimator):
         num_inliers = int((r2 < inlier_threshold**2).sum())
         # Inliers on a line leave the turn about it free: that is no answer either.
         thinnest = min(spread(half, (r2 < inlier_threshold**2) * 1.0) for half in (rows[:, :3], rows[:, 3:]))
-        if len(answer.correspondence_set) < 3 or num_inliers < 3 or thinnest < 0.05 * inlier_threshold:
+        firm = expert().consensus.least_spread * inlier_threshold
+        if len(answer.correspondence_set) < 3 or num_inliers < 3 or thinnest < firm:
             return []
         score = float(np.maximum(1 - r2 / inlier_threshold**2, 0).sum())
         return [Hypothesis(T, score, num_inliers)]

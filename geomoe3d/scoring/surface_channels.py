@@ -83,7 +83,7 @@ class SurfaceChannels:
             view = None
             if places is not None:
                 away = np.linalg.norm(points - places[k], axis=1) / self._threshold / 40
-                view = RangeImage.of(other.points, places[1 - k])
+                view = RangeImage.of(other.points, places[1 - k], 2.5)  # degrees, as the network was trained
             return _Side(
                 points,
                 cloud.normals[rows[k]],

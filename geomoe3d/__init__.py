@@ -1,4 +1,4 @@
-"""geomoe3d: two scans in, the rigid transform out, with an honest word on how sure it is.
+"""geomoe3d: two scans in, the rigid transform out, and how far it can be relied on.
 
     import geomoe3d
     result = geomoe3d.register("source.ply", "target.ply")

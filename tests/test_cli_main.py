@@ -88,3 +88,18 @@ def test_help_answers_within_a_second_and_loads_no_library():
         assert last.startswith("0 [] ")
         seconds.append(float(last.split()[-1]))
     assert min(seconds) < 1.0
+
+
+def test_the_help_sets_options_for_experts_apart(capsys):
+    assert call("register", "--help") == 0
+    usual, expert = capsys.readouterr().out.split("Options for experts:")
+    for option in ("--output", "--aligned", "--voxel-size", "--report"):
+        assert option in usual.split("Options:")[1]
+    for option in ("--descriptor", "--scorer", "--set", "--seed", "--traceback"):
+        assert f"\n  {option} " in expert
+
+
+def test_no_purpose_in_the_help_is_cut_short(capsys):
+    for verb in ((), ("data",), ("evaluate",)):
+        assert call(*verb, "--help") == 0
+        assert "..." not in capsys.readouterr().out.split("Commands:")[1]

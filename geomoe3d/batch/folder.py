@@ -16,6 +16,7 @@ from urllib.parse import quote
 from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.result import RegistrationResult
+from geomoe3d.runtime.files import make_folder, refusals, remove
 from geomoe3d.runtime.journal import Journal
 from geomoe3d.runtime.words import counted
 
@@ -65,10 +66,8 @@ def check_can_be_folder(path: Path, what: str) -> Path:
     Raises:
         OutputError: a file is in the way.
     """
-    try:
+    with refusals(f"cannot make the folder '{path}'"):  # e.g. a name too long
         there = next(place for place in (path, *path.parents) if place.exists())
-    except OSError as error:  # e.g. a name too long
-        raise OutputError(f"cannot make the folder '{path}': {error.strerror}") from None
     if not there.is_dir():
         raise OutputError(f"'{there}' is a file; {what}")
     return there
@@ -154,19 +153,6 @@ def remove_batch(folder: Path) -> None:
     remove([*table, *(folder / name for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE))])
 
 
-def remove(paths: Iterable[Path]) -> None:
-    """Delete files, if they are there.
-
-    Raises:
-        OutputError: one cannot be removed.
-    """
-    for path in paths:
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot remove '{path}': {error.strerror}") from None
-
-
 def transform_name(name: str) -> str:
     """The file of the transform of a pair: its id, odd characters as %XX."""
     return f"{_stem(name)}.txt"
@@ -196,18 +182,6 @@ def pair_mark(name: str) -> str:
 def is_own_page(path: Path) -> bool:
     """By its mark, which names its pair: a copy under another name is the user's."""
     return f'<meta name="geomoe3d-pair" content="{path.name}">'.encode() in _head(path)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder if it is not there.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
 
 
 def write_transforms(folder: Path, results: Iterable[tuple[str, RegistrationResult]]) -> None:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from geomoe3d.batch.folder import files_in, is_own_page, make_folder, page_name, pair_mark, remove
+from geomoe3d.batch.folder import files_in, is_own_page, page_name, pair_mark
 from geomoe3d.batch.store import Outcome
 from geomoe3d.batch.table import PairRow
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.transform_files import has_transform
 from geomoe3d.errors import GeoMoE3DError, OutputError
-from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.files import make_folder, remove, write_text
 from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.visual.page import render_page
 from geomoe3d.visual.view import RegistrationView

@@ -37,7 +37,7 @@ from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.csv_text import csv_text
-from geomoe3d.runtime.files import write_atomically, write_text
+from geomoe3d.runtime.files import make_folder, write_atomically, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
 from geomoe3d.runtime.provenance import differences, hardware, in_words, source_commit
 
@@ -139,10 +139,7 @@ class BatchStore:
             return
         if self._fresh:
             remove_batch(self.folder)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot make the folder '{self.folder}': {error.strerror}") from None
+        make_folder(self.folder)
         text = {
             "identity": self._identity,
             "commit": source_commit(),

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, scale_option, worker_options
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
-    from geomoe3d.config import RegistrationConfig
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red", "error": "red"}
 
 
-@click.command(context_settings=HELP, short_help="Register a table of pairs, on one machine or a cluster.")
+@click.command(
+    cls=Verb, context_settings=HELP, short_help="Register a table of pairs, on one machine or a cluster."
+)
 @click.argument("pairs", metavar="PAIRS.csv")
 @click.argument("out", metavar="OUT")
 @worker_options
@@ -28,7 +29,9 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @click.option("--transforms", is_flag=True, help="Write OUT/transforms/<id>.txt for every pair.")
 @click.option("--page/--no-page", default=False, help="Write OUT/page.html with a picture of every pair.")
 @click.option(
-    "--pages", is_flag=True, help="Write OUT/pages/<id>.html for every pair, to turn its clouds in."
+    "--pages",
+    is_flag=True,
+    help="Write OUT/pages/<id>.html, in which the clouds can be turned, for every pair.",
 )
 @click.option("--fresh", is_flag=True, help="Delete the results of an earlier batch in OUT first.")
 @click.option("--retry", is_flag=True, help="Try the pairs again that could not be registered.")
@@ -37,21 +40,7 @@ _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "fa
 @part_option("reader")
 @traceback_option
 @click.pass_context
-def command(
-    context: click.Context,
-    pairs: str,
-    out: str,
-    workers: int | None,
-    scheduler: str | None,
-    config: RegistrationConfig,
-    transforms: bool,
-    page: bool,
-    pages: bool,
-    fresh: bool,
-    retry: bool,
-    cache: str | None,
-    quiet: bool,
-) -> None:
+def command(context: click.Context, /, pairs: str, out: str, quiet: bool, **given: Any) -> None:
     """Register every pair listed in PAIRS.csv and write the results to the folder OUT.
 
     The table needs the columns source and target. Optional columns: id, and an initial transform, either
@@ -59,24 +48,16 @@ def command(
     interrupted batch continues when it is started again. A file that cannot be read affects its own pairs
     only. Exit code 0 if every pair is ok, 3 if not, 2 for unusable input.
     """
-    from geomoe3d.batch.run import ALL_THAT_FIT, register_pairs
+    from geomoe3d.batch.run import register_pairs
     from geomoe3d.cli.progress import stdout_to_stderr
 
     with stdout_to_stderr():
         report = register_pairs(
             pairs,
             out,
-            config=config,
-            workers=ALL_THAT_FIT if workers is None and scheduler is None else workers,
-            scheduler=scheduler,
-            transforms=transforms,
-            page=page,
-            pages=pages,
-            fresh=fresh,
-            retry=retry,
-            cache=cache,
             progress=False if quiet else None,
             say=lambda text: None if quiet else click.echo(text, err=True),
+            **given,
         )
     if not quiet:
         click.echo(table(report), color=False if os.environ.get("NO_COLOR") else None)

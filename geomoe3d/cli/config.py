@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import click
 
-from geomoe3d.cli.errors import HELP, renamed, traceback_option
+from geomoe3d.cli.errors import HELP, Verb, renamed, traceback_option
 
 
-@click.command(context_settings=HELP, short_help="Print the complete configuration, commented.")
+@click.command(cls=Verb, context_settings=HELP, short_help="Print the complete configuration, commented.")
 @click.option("--config", "source", metavar="FILE", help="Start from this YAML file.")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="Change one value.")
 @click.option(

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, refuse_bare_settings, renamed, renamed_verb, traceback_option
+from geomoe3d.cli.errors import (
+    HELP,
+    ExitCode,
+    Verb,
+    refuse_bare_settings,
+    renamed,
+    renamed_verb,
+    traceback_option,
+)
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
@@ -29,7 +37,7 @@ def command() -> None:
     """Check, generate and prepare training and test data."""
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Check a folder of data and name broken files.")
 @click.argument("root", type=click.Path())
 @click.option("--quick", is_flag=True, help="List only; do not open the fragments.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
@@ -87,7 +95,7 @@ def _print(report: CheckReport) -> None:
     click.echo("usable" if report.usable else "not usable as it is")
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Fuse depth frames into fragments.")
 @click.argument("frames", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--count", default=50, show_default=True, help="Number of frames fused into one fragment.")
@@ -182,7 +190,7 @@ def _intrinsics(text: str) -> FloatArray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Generate rooms and record fragments in them.")
 @click.argument("out", type=click.Path())
 @click.argument("bare", nargs=-1, metavar="")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One setting; repeatable.")
@@ -191,7 +199,13 @@ def _intrinsics(text: str) -> FloatArray:
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Another seed, another set."
 )
-@click.option("--models", multiple=True, type=click.Path(), help="Folder of furniture models; repeatable.")
+@click.option(
+    "--models",
+    "model_folders",
+    multiple=True,
+    type=click.Path(),
+    help="Folder of furniture models; repeatable.",
+)
 @click.option(
     "--mesh", "meshes", multiple=True, type=click.Path(), help="Whole scene to walk through; repeatable."
 )
@@ -202,13 +216,9 @@ def synthesize(
     out: str,
     bare: tuple[str, ...],
     assignments: tuple[str, ...],
-    scenes: int,
-    workers: int,
-    seed: int,
-    models: tuple[str, ...],
-    meshes: tuple[str, ...],
     config: str | None,
     show: bool,
+    **given: Any,
 ) -> None:
     """Generate furnished rooms and record fragments in them, into the folder OUT.
 
@@ -236,16 +246,7 @@ def synthesize(
         click.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), nl=False)
         return
     with stdout_to_stderr(), progress_bar("scenes") as advance:
-        report = make(
-            out,
-            scenes,
-            seed=seed,
-            workers=workers,
-            settings=settings,
-            model_folders=list(models),
-            meshes=list(meshes),
-            progress=advance,
-        )
+        report = make(out, given.pop("scenes"), settings=settings, progress=advance, **given)
         write_report(report, Path(out) / "report.md")
         some = [Path(out) / scene_name(scene.number) for scene in report.scenes if scene.num_points][:8]
         if some:
@@ -253,7 +254,7 @@ def synthesize(
     click.echo(report_text(report), nl=False)
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Compute the features of fragments once.")
 @click.argument("root", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--group", "groups", multiple=True, help="List of pairs to take, e.g. train_info; repeatable.")
@@ -276,14 +277,12 @@ def synthesize(
 @click.pass_context
 def features(
     context: click.Context,
+    /,
     root: str,
     out: str,
     groups: tuple[str, ...],
     scenes: tuple[str, ...],
-    split: str | None,
-    min_overlap: float,
-    voxel_size: float,
-    workers: int,
+    **given: Any,
 ) -> None:
     """Compute the features of the fragments of ROOT once and store them in OUT, where training reads them.
 
@@ -296,15 +295,7 @@ def features(
 
     with stdout_to_stderr(), progress_bar("scenes") as advance:
         report = describe_collection(
-            root,
-            out,
-            groups=groups or None,
-            scenes=scenes or None,
-            split=split,
-            min_overlap=min_overlap,
-            voxel_size=voxel_size,
-            workers=workers,
-            progress=advance,
+            root, out, groups=groups or None, scenes=scenes or None, progress=advance, **given
         )
     for line in report.skipped:
         click.echo(f"skipped: {line}", err=True)
@@ -316,7 +307,9 @@ def features(
     context.exit(0 if report.made or report.kept else ExitCode.BAD_INPUT)
 
 
-@command.command(context_settings=HELP)
+@command.command(
+    cls=Verb, context_settings=HELP, short_help="Draw pairs with proposed transforms, to train on."
+)
 @click.argument("features", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option(

@@ -6,12 +6,12 @@ import json
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 
 _COLORS = {"ok": "green", "missing": "yellow", "broken": "red"}
 
 
-@click.command(context_settings=HELP, short_help="Check the installation and say how to repair it.")
+@click.command(cls=Verb, context_settings=HELP, short_help="Check the installation and say how to repair it.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @traceback_option
 @click.pass_context

@@ -35,6 +35,31 @@ class ExitCode(IntEnum):
 HELP = {"help_option_names": ["-h", "--help"]}
 """Click's settings of every command."""
 
+_FOR_EXPERTS = {
+    *("part_descriptor", "part_matcher", "part_filter", "part_estimator", "part_refiner", "part_scorers"),
+    *("assignments", "config_file", "weights", "correspondences", "seed", "cache", "no_cache", "scheduler"),
+    *("reader", "writer", "traceback", "optimizer"),
+}
+"""Parameters that one can do without knowing."""
+
+
+class Verb(click.Command):
+    """A verb in whose help the options for experts stand apart, behind the others."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Both kinds, each in the order in which they were declared."""
+        rows: dict[str, list[tuple[str, str]]] = {"Options": [], "Options for experts": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx) if isinstance(parameter, click.Option) else None
+            if record is not None:
+                kind = "Options for experts" if parameter.name in _FOR_EXPERTS else "Options"
+                rows[kind].append(record)
+        for title, records in rows.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
 _TRACEBACK = "geomoe3d.traceback"
 _COMMAND = "geomoe3d.command"
 

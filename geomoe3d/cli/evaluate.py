@@ -4,96 +4,84 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, command_line, traceback_option
-from geomoe3d.cli.parts import method_part_options
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, command_line, traceback_option
+from geomoe3d.cli.parts import method_part_options, together
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.evaluation.score import ScoredRun
 
 
-@click.group(context_settings=HELP)
+@click.group(context_settings=HELP, short_help="Measure registration methods on benchmarks.")
 def command() -> None:
     """Measure registration methods on benchmarks: recall, errors, confidence, time."""
 
 
-def _prediction_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    for option in reversed(
-        (
-            click.argument("study", metavar="OUT", type=click.Path(file_okay=False)),
-            click.option(
-                "--method",
-                "methods",
-                metavar="NAME",
-                multiple=True,
-                required=True,
-                help="A name from `evaluate methods`, or FILE.py:FUNCTION. Repeatable.",
-            ),
-            click.option(
-                "--benchmark",
-                "benchmarks",
-                metavar="NAME",
-                multiple=True,
-                default=("3DMatch",),
-                show_default=True,
-                help="3DMatch, 3DLoMatch, unrelated, or a folder. Repeatable.",
-            ),
-            click.option(
-                "--track",
-                metavar="NAME",
-                default="clouds",
-                show_default=True,
-                help="Input: 1k or all (fixed correspondences), or clouds (end to end).",
-            ),
-            click.option(
-                "--every", metavar="N", default=1, show_default=True, help="Use every n-th pair only."
-            ),
-            click.option(
-                "--unrelated",
-                "num_unrelated",
-                metavar="N",
-                default=200,
-                show_default=True,
-                help="Number of pairs of the benchmark unrelated.",
-            ),
-            click.option(
-                "--set",
-                "assignments",
-                metavar="KEY=VALUE",
-                multiple=True,
-                help="Configuration of geomoe3d and of networks with weights of yours; repeatable.",
-            ),
-            method_part_options,
-            click.option(
-                "--label", metavar="NAME", help="Name of the run, if there is one method. [the method's]"
-            ),
-            click.option(
-                "--data", "root", metavar="FOLDER", help="Folder of the benchmarks. [GEOMOE3D_DATA]"
-            ),
-            click.option(
-                "--workers",
-                metavar="N",
-                default=1,
-                show_default=True,
-                help="Processes; with two or more, a method that crashes loses one pair only.",
-            ),
-            click.option(
-                "--seed", metavar="N", default=0, show_default=True, help="Random seed of the methods."
-            ),
-            click.option("--fresh", is_flag=True, help="Remove the stored answers of these runs first."),
-        )
-    ):
-        function = option(function)
-    return function
+_prediction_options = together(
+    click.argument("study", metavar="OUT", type=click.Path(file_okay=False)),
+    click.option(
+        "--method",
+        "methods",
+        metavar="NAME",
+        multiple=True,
+        required=True,
+        help="A name from `evaluate methods`, or FILE.py:FUNCTION. Repeatable.",
+    ),
+    click.option(
+        "--benchmark",
+        "benchmarks",
+        metavar="NAME",
+        multiple=True,
+        default=("3DMatch",),
+        show_default=True,
+        help="3DMatch, 3DLoMatch, unrelated, or a folder. Repeatable.",
+    ),
+    click.option(
+        "--track",
+        metavar="NAME",
+        default="clouds",
+        show_default=True,
+        help="Input: 1k or all (fixed correspondences), or clouds (end to end).",
+    ),
+    click.option("--every", metavar="N", default=1, show_default=True, help="Use every n-th pair only."),
+    click.option(
+        "--unrelated",
+        "num_unrelated",
+        metavar="N",
+        default=200,
+        show_default=True,
+        help="Number of pairs of the benchmark unrelated.",
+    ),
+    click.option(
+        "--set",
+        "assignments",
+        metavar="KEY=VALUE",
+        multiple=True,
+        help="Configuration of geomoe3d and of networks with weights of yours; repeatable.",
+    ),
+    method_part_options,
+    click.option("--label", metavar="NAME", help="Name of the run, if there is one method. [the method's]"),
+    click.option("--data", "root", metavar="FOLDER", help="Folder of the benchmarks. [GEOMOE3D_DATA]"),
+    click.option(
+        "--workers",
+        metavar="N",
+        default=1,
+        show_default=True,
+        help="Processes; with two or more, a method that crashes loses one pair only.",
+    ),
+    click.option("--seed", metavar="N", default=0, show_default=True, help="Random seed of the methods."),
+    click.option("--fresh", is_flag=True, help="Remove the stored answers of these runs first."),
+)
 
 
-@command.command(context_settings=HELP)
+@command.command(
+    cls=Verb, context_settings=HELP, short_help="Run methods on benchmarks and store their answers."
+)
 @_prediction_options
 @traceback_option
 def predict(**given: Any) -> None:
@@ -105,7 +93,7 @@ def predict(**given: Any) -> None:
     _predict(**given)
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Predict, score, and write reports.")
 @_prediction_options
 @traceback_option
 def run(**given: Any) -> None:
@@ -121,7 +109,7 @@ def run(**given: Any) -> None:
     click.echo(f"report: {study / 'report.html'}")
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Score the answers that are stored.")
 @click.argument("study", metavar="OUT", type=click.Path(file_okay=False))
 @click.option("--raw", is_flag=True, help="Use the true rotations as published, not projected onto SO(3).")
 @click.option(
@@ -151,7 +139,7 @@ def score(study: str, raw: bool, reports: tuple[str, ...], force: bool, quiet: b
         write_report(report, runs, force=force)
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Compare two runs pair by pair.")
 @click.argument("first", metavar="RUN", type=click.Path(file_okay=False))
 @click.argument("second", metavar="RUN", type=click.Path(file_okay=False))
 @traceback_option
@@ -169,7 +157,7 @@ def compare(first: str, second: str) -> None:
     click.echo(terminal_comparison(a, b, compare_scores(a, b)))
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="List the methods and what is not installed.")
 @traceback_option
 def methods() -> None:
     """List the methods, the inputs each accepts, and what is not installed."""
@@ -185,7 +173,7 @@ def methods() -> None:
         click.echo(f"{name:24} {'correspondences':26} with weights of yours: --set filter.weights=FILE")
 
 
-@command.command(context_settings=HELP)
+@command.command(cls=Verb, context_settings=HELP, short_help="Measure poses or homographies of photographs.")
 @click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=click.Path(exists=True))
 @click.option("--weights", type=click.Path(), help="Network that weighs matches (.safetensors).")
 @click.option("--pairs", default=200, show_default=True, type=click.IntRange(min=2), help="Per scene.")

@@ -23,14 +23,14 @@ def part_option(kind: Kind) -> Callable[[Command], Command]:
             for spec in specs:
                 use_part(kind, spec)
 
-    verb = "Reads" if kind == "reader" else "Writes"
+    verb = "reads" if kind == "reader" else "writes"
     return click.option(
         f"--{kind}",
         metavar="FILE.py:NAME",
         multiple=True,
         expose_value=False,
         callback=use,
-        help=f"{verb} files of a kind of your own; repeatable.",
+        help=f"Python code of yours that {verb} further kinds of files; repeatable.",
     )
 
 

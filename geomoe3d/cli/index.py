@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import HELP, traceback_option
+from geomoe3d.cli.errors import HELP, Verb, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import configuration_options
 from geomoe3d.runtime.words import counted
@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
 
 
-@click.command(context_settings=HELP, short_help="Index a large cloud once, to find scans in it.")
+@click.command(
+    cls=Verb, context_settings=HELP, short_help="Prepare a large cloud as a map, to find scans in it."
+)
 @click.argument("inputs", metavar="CLOUDS... OUT.map", nargs=-1, required=True)
 @click.option(
     "--poses",
     metavar="FILE",
-    help="Where each cloud lies in the map (TUM, KITTI or JSON, in their order). [they lie as they are]",
+    help="Where each cloud lies in the map (TUM, KITTI or JSON). [all are in one coordinate system]",
 )
 @configuration_options
 @click.option("--fresh", is_flag=True, help="Begin anew where OUT.map exists; else clouds are added to it.")
@@ -32,11 +34,11 @@ if TYPE_CHECKING:
 def command(
     inputs: tuple[str, ...], poses: str | None, config: RegistrationConfig, fresh: bool, quiet: bool
 ) -> None:
-    """Index CLOUDS (files, or folders of them), one map together, in the file OUT.map.
+    """Prepare CLOUDS (files, or folders of them) as one map, the file OUT.map.
 
     `geomoe3d locate` finds scans in it. Called again with more clouds, or after an interruption, it reads only those
-    that are not in it yet. LAS and LAZ are read in pieces. With --poses the clouds are taken for scans, whose sensors
-    stood where `register` believes them to have stood.
+    that are not in it yet. LAS and LAZ are read in pieces. With --poses each cloud is one scan in coordinates of its
+    own.
     """
     if len(inputs) < 2:
         raise click.UsageError("give at least one cloud, and OUT.map last")

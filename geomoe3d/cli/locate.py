@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import check_outputs, part_option
 from geomoe3d.cli.parts import configuration_options, sensor_place, unit_option
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Form = Literal["text", "json", "quiet"]
 
 
-@click.command(context_settings=HELP, short_help="Find scans in a map, and say how sure.")
+@click.command(cls=Verb, context_settings=HELP, short_help="Find scans in a map, and say how sure.")
 @click.argument("inputs", metavar="SCANS... MAP", nargs=-1, required=True)
 @configuration_options
 @click.option(
@@ -33,17 +33,19 @@ Form = Literal["text", "json", "quiet"]
     type=click.IntRange(1),
     default=3,
     show_default=True,
-    help="Places named at most.",
+    help="Most candidate places to list.",
 )
-@click.option("--near", metavar="X,Y,Z", help="Where the sensor is believed to be, in the map's coordinates.")
-@click.option("--within", type=float, metavar="LENGTH", help="How far off that may be.")
+@click.option("--near", metavar="X,Y,Z", help="Roughly where the scanner stood, in the map's coordinates.")
+@click.option(
+    "--within", type=float, metavar="LENGTH", help="How far off --near may be, in the unit of the map."
+)
 @click.option(
     "--initial", metavar="FILE", help="A first guess of the transform, as of `register`; one scan only."
 )
 @click.option(
     "--sensor",
     metavar="X,Y,Z",
-    help="Where each scan's sensor stood, in the scan's own coordinates; none: no one sensor. [found from the scan]",
+    help="Where the scanner of each scan stood, in the scan's own coordinates; 'none': at no single place. [found]",
 )
 @unit_option
 @click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per scan and nothing else.")
@@ -54,8 +56,8 @@ Form = Literal["text", "json", "quiet"]
 @click.option(
     "--quiet",
     is_flag=True,
-    help="No progress; the four rows of the matrix alone (of several scans none: give --output), and one line on "
-    "stderr for each that is not ok.",
+    help="Print the four rows of the matrix alone (of several scans nothing: give --output), and one line of warning "
+    "for each scan that is not ok.",
 )
 @part_option("reader")
 @traceback_option

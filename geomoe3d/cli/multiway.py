@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, worker_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
-    from geomoe3d.config import RegistrationConfig
     from geomoe3d.multiway.model import SceneModel
 
 
-@click.command(context_settings=HELP, short_help="Register many scans into one model.")
+@click.command(cls=Verb, context_settings=HELP, short_help="Register many scans into one model.")
 @click.argument("inputs", metavar="SCANS... OUT", nargs=-1, required=True)
 @click.option(
     "--pairs",
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--model-voxel-size",
+    "merged_voxel_size",
     type=float,
     metavar="LENGTH",
     help="Edge of a voxel of the merged cloud. [that of the scans]",
@@ -85,24 +85,11 @@ if TYPE_CHECKING:
 @click.pass_context
 def command(
     context: click.Context,
+    /,
     inputs: tuple[str, ...],
-    pairs: str,
-    neighbors: int,
-    rounds: int,
-    model_voxel_size: float | None,
-    workers: int | None,
-    scheduler: str | None,
-    config: RegistrationConfig,
-    page: bool,
-    sequence: bool,
-    initial: str | None,
-    initial_error: tuple[float, float] | None,
-    second_look: str,
-    optimizer: Literal["open3d", "gtsam"],
-    e57: bool,
-    fresh: bool,
-    cache: str | None,
+    merged_voxel_size: float | None,
     quiet: bool,
+    **given: Any,
 ) -> None:
     """Register all SCANS (files, or folders of them) into one model, written to the folder OUT.
 
@@ -114,33 +101,18 @@ def command(
 
     if len(inputs) < 2:
         raise click.UsageError("give at least one folder of scans, or two scans, and OUT last")
-    if model_voxel_size is not None and not model_voxel_size > 0:
-        raise click.UsageError(f"--model-voxel-size must be positive, found {model_voxel_size}")
-    from geomoe3d.batch.run import ALL_THAT_FIT
+    if merged_voxel_size is not None and not merged_voxel_size > 0:
+        raise click.UsageError(f"--model-voxel-size must be positive, found {merged_voxel_size}")
     from geomoe3d.multiway.run import register_scans
 
     with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:
         model = register_scans(
             inputs[:-1],
             inputs[-1],
-            config=config,
-            pairs=pairs,
-            neighbors=neighbors,
-            rounds=rounds,
-            merged_voxel_size=model_voxel_size,
-            page=page,
-            workers=ALL_THAT_FIT if workers is None and scheduler is None else workers,
-            scheduler=scheduler,
-            cache=cache,
-            fresh=fresh,
-            sequence=sequence,
-            initial=initial,
-            initial_error=initial_error,
-            second_look=second_look,
-            optimizer=optimizer,
-            e57=e57,
+            merged_voxel_size=merged_voxel_size,
             progress=progress,
             say=lambda text: None if quiet else click.echo(text, err=True),
+            **given,
         )
     if not quiet:
         click.echo(summary(model), color=False if os.environ.get("NO_COLOR") else None)

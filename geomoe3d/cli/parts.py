@@ -1,4 +1,4 @@
-"""Options that every verb that registers pairs has: its configuration with the parts in it, and its workers."""
+"""Options that several verbs have: the configuration with the parts in it, the workers, the cache."""
 
 from __future__ import annotations
 
@@ -9,56 +9,83 @@ from typing import Any, TypeVar
 import click
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 _PARTS = (
     ("descriptor", "descriptor.name", "Features of each point: fpfh, multiscale or learned. [fpfh]"),
-    ("matcher", "matching.name", "one_way, mutual, ratio or dual_softmax. [one_way]"),
+    ("matcher", "matching.name", "How points are matched: one_way, mutual, ratio or dual_softmax. [one_way]"),
     ("filter", "filter.name", "Outlier rejection: none, spectral, or a network. [none]"),
-    ("estimator", "estimator.name", "consensus, ransac or svd. [consensus]"),
-    ("refiner", "refinement.name", "gicp, icp, svd or none. [gicp]"),
+    ("estimator", "estimator.name", "What proposes transforms: consensus, ransac or svd. [consensus]"),
+    ("refiner", "refinement.name", "What refines them: gicp, icp, svd or none. [gicp]"),
 )
 
 
-_SETTINGS = (
-    ("--voxel-size", "voxel_size", "LENGTH", "Edge of the voxel grid, in the clouds' unit. [chosen]"),
-    ("--seed", "seed", "N", "Random seed: the same seed, the same answers. [0]"),
-    ("--config", "config_file", "FILE", "Configuration (YAML); `geomoe3d config` prints one."),
-)
+def together(*options: Option, then: Callable[[dict[str, Any]], None] = lambda named: None) -> Option:
+    """Several options as one decorator, in the order of the help.
+
+    Args:
+        options: decorators as `click.option` gives them.
+        then: called with the keywords of the command before it, to change them in place.
+    """
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def with_options(*args: Any, **named: Any) -> Any:
+            then(named)
+            return command(*args, **named)
+
+        whole: Callable[..., Any] = with_options
+        for option in reversed(options):
+            whole = option(whole)
+        return whole
+
+    return add
 
 
-def worker_options(command: Command) -> Command:
-    """Adds ``--workers`` and ``--scheduler``."""
-    scheduler = click.option(
-        "--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead."
-    )(command)
-    result: Command = click.option(
+def _all_that_fit(named: dict[str, Any]) -> None:
+    if named["workers"] is None and named["scheduler"] is None:
+        from geomoe3d.batch.run import ALL_THAT_FIT
+
+        named["workers"] = ALL_THAT_FIT
+
+
+worker_options = together(
+    click.option(
         "--workers",
         type=click.IntRange(1),
         metavar="N",
         help="Parallel processes on this machine. [as many as cores and memory allow]",
-    )(scheduler)
-    return result
+    ),
+    click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a Dask cluster instead."),
+    then=_all_that_fit,
+)
+"""Adds ``--workers`` and ``--scheduler``, as `geomoe3d.batch.run.register_pairs` takes them."""
 
+scale_option = click.option(
+    "--estimate-scale",
+    is_flag=True,
+    help="Estimate the scale too (1/1000 to 1000): the files may be in different units.",
+)
+"""Adds ``--estimate-scale``, for verbs with `configuration_options`."""
 
-def scale_option(command: Command) -> Command:
-    """Adds ``--estimate-scale``, for verbs with `configuration_options`."""
-    result: Command = click.option(
-        "--estimate-scale",
-        is_flag=True,
-        help="The ratio of the clouds' lengths is unknown (1/1000 to 1000): estimate it too.",
-    )(command)
-    return result
+unit_option = click.option(
+    "--unit",
+    metavar="NAME",
+    default="",
+    help="Name of the files' unit of length, such as m; shown behind lengths, nothing is converted.",
+)
+"""Adds ``--unit``."""
 
-
-def unit_option(command: Command) -> Command:
-    """Adds ``--unit``."""
-    result: Command = click.option(
-        "--unit",
-        metavar="NAME",
-        default="",
-        help="Name of the files' unit of length, such as m; shown behind lengths, nothing is converted.",
-    )(command)
-    return result
+cache_options = together(
+    click.option(
+        "--cache",
+        metavar="FOLDER",
+        help="Where features are kept for later. [the user's cache folder]",
+    ),
+    click.option("--no-cache", is_flag=True, help="Keep no features for later."),
+    then=lambda named: named.update({"cache": ""} if named.pop("no_cache") else {}),
+)
+"""Adds ``--cache`` and ``--no-cache``; the command gets ``cache``, empty for none."""
 
 
 def sensor_place(text: str | None, option: str) -> Any:
@@ -74,92 +101,77 @@ def sensor_place(text: str | None, option: str) -> Any:
     return x, y, z
 
 
-def cache_options(command: Command) -> Command:
-    """Adds ``--cache`` and ``--no-cache``; the command gets ``cache``, empty for none."""
+def _assign_parts(named: dict[str, Any]) -> None:
+    """Parts as assignments; that there are such parts is seen before anything is read.
 
-    @wraps(command)
-    def with_cache(*args: Any, **named: Any) -> Any:
-        if named.pop("no_cache"):
-            named["cache"] = ""
-        return command(*args, **named)
-
-    none: Any = click.option("--no-cache", is_flag=True, help="Cache no features: compute them anew.")(
-        with_cache
-    )
-    result: Command = click.option(
-        "--cache", metavar="FOLDER", help="Where features are cached. [the user's cache folder]"
-    )(none)
-    return result
-
-
-def method_part_options(command: Command) -> Command:
-    """Adds ``--descriptor`` and its like; the command finds what they come to at the end of its ``assignments``.
-
-    A part is a name or a class of the user's own, ``file.py:Class`` or ``module:Class``.
+    Raises:
+        ConfigError: there is none of a name.
     """
+    given = [(option, key, named.pop(f"part_{option}")) for option, key, _ in _PARTS]
+    given = [(option, key, value) for option, key, value in given if value is not None]
+    scorers = named.pop("part_scorers")
+    chosen = [f"{key}={value}" for _, key, value in given]
+    if scorers:
+        chosen.append(f"scoring.scorers=[{', '.join(scorers)}]")
+    if chosen:  # nothing is loaded where none is named
+        from geomoe3d.pipeline import REGISTRIES
 
-    @wraps(command)
-    def with_parts(*args: Any, **named: Any) -> Any:
-        given = [(option, key, named.pop(f"part_{option}")) for option, key, _ in _PARTS]
-        given = [(option, key, value) for option, key, value in given if value is not None]
-        scorers = named.pop("part_scorers")
-        _check([(option, value) for option, _, value in given] + [("scorer", name) for name in scorers])
-        chosen = [f"{key}={value}" for _, key, value in given]
-        if scorers:
-            chosen.append(f"scoring.scorers=[{', '.join(scorers)}]")
-        named["assignments"] = (*named["assignments"], *chosen)
-        return command(*args, **named)
+        for option, name in [
+            *((option, value) for option, _, value in given),
+            *(("scorer", s) for s in scorers),
+        ]:
+            REGISTRIES[option].find(name)
+    named["assignments"] = (*named["assignments"], *chosen)
 
-    wrapped: Any = click.option(
+
+method_part_options = together(
+    *(click.option(f"--{name}", f"part_{name}", metavar="NAME", help=text) for name, _, text in _PARTS),
+    click.option(
         "--scorer",
         "part_scorers",
         metavar="NAME",
         multiple=True,
         help="What scores the hypotheses: surfaces, network, or your own; repeatable. [surfaces, network]",
-    )(with_parts)
-    for option, _, text in reversed(_PARTS):
-        wrapped = click.option(f"--{option}", f"part_{option}", metavar="NAME", help=text)(wrapped)
-    result: Command = wrapped
-    return result
+    ),
+    then=_assign_parts,
+)
+"""Adds ``--descriptor`` and its like; the command finds what they come to at the end of its ``assignments``.
+
+A part is a name or a class of the user's own, ``file.py:Class`` or ``module:Class``."""
 
 
-def configuration_options(command: Command) -> Command:
-    """Adds the options; the command gets what they come to as ``config``, a `RegistrationConfig`.
+def _configure(named: dict[str, Any]) -> None:
+    from geomoe3d.config import load_config
 
-    An option overrides ``--set``, which overrides the file.
-    """
+    settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
+    settings.append(("scale", "estimate" if named.pop("estimate_scale", False) else None))
+    chosen = [f"{key}={value}" for key, value in settings if value is not None]
+    named["config"] = load_config(named.pop("config_file"), [*named.pop("assignments"), *chosen])
 
-    @wraps(command)
-    def with_config(*args: Any, **named: Any) -> Any:
-        from geomoe3d.config import load_config
 
-        settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
-        settings.append(("scale", "estimate" if named.pop("estimate_scale", False) else None))
-        chosen = [f"{key}={value}" for key, value in settings if value is not None]
-        file, assignments = named.pop("config_file"), named.pop("assignments")
-        return command(*args, **named, config=load_config(file, [*assignments, *chosen]))
-
-    wrapped: Any = click.option(
+configuration_options = together(
+    click.option(
+        "--voxel-size",
+        metavar="LENGTH",
+        help="Edge of the grid that points are thinned to, in the unit of the files. [chosen]",
+    ),
+    click.option("--seed", metavar="N", help="Random seed: the same seed, the same answers. [0]"),
+    click.option(
+        "--config",
+        "config_file",
+        metavar="FILE",
+        help="File of settings (YAML), as `geomoe3d config` prints them.",
+    ),
+    click.option(
         "--set",
         "assignments",
         metavar="KEY=VALUE",
         multiple=True,
-        help="One value of the configuration; repeatable.",
-    )(method_part_options(with_config))
-    for option, name, metavar, text in reversed(_SETTINGS):
-        wrapped = click.option(option, name, metavar=metavar, help=text)(wrapped)
-    result: Command = wrapped
-    return result
+        help="One setting, such as decision.min_confidence=0.98; repeatable.",
+    ),
+    method_part_options,
+    then=_configure,
+)
+"""Adds the options; the command gets what they come to as ``config``, a `RegistrationConfig`.
 
-
-def _check(names: list[tuple[str, str]]) -> None:
-    """Whether there are such parts, before anything is read; nothing is loaded where none is named.
-
-    Raises:
-        ConfigError: there is none of a name.
-    """
-    if names:
-        from geomoe3d.pipeline import REGISTRIES
-
-        for option, name in names:
-            REGISTRIES[option].find(name)
+An option overrides ``--set``, which overrides the file."""

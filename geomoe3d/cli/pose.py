@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import filecmp
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import check_outputs
+from geomoe3d.cli.parts import Option, together
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
@@ -21,41 +21,34 @@ if TYPE_CHECKING:
     from geomoe3d.types import BoolArray, FloatArray
 
 
-def _shared(
-    estimators: tuple[str, ...], threshold: str
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(
-            (
-                click.argument("image0", type=click.Path()),
-                click.argument("image1", type=click.Path()),
-                click.option("--detector", default="rootsift", show_default=True,
-                             type=click.Choice(("rootsift", "sift", "orb")), help="What finds keypoints."),
-                click.option("--keypoints", metavar="N", default=2000, show_default=True,
-                             type=click.IntRange(8, 100_000), help="Most per image."),
-                click.option("--matches", type=click.Choice(("distinct", "loose", "mutual", "all")),
-                             help="Which nearest neighbours go to the estimator: mutual ones that pass the ratio test "
-                             "at 0.8 or, loosely, at 0.95, all mutual ones, or all. [distinct; loose with --weights]"),
-                click.option("--weights", metavar="FILE",
-                             help="Network that rejects wrong matches (.safetensors, see configs/train/images)."),
-                click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators),
-                             help="What fits the matches that are right and rejects the others."),
-                click.option("--threshold", metavar="PIXELS", type=click.FloatRange(min=0, min_open=True),
-                             help=f"Inlier threshold. [{threshold}]"),
-                click.option("--seed", metavar="N", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1),
-                             help="Random seed: the same seed, the same answers."),
-                click.option("--output", metavar="FILE.json", help="Write the answer as JSON."),
-                click.option("--picture", metavar="FILE", help="Draw the matches: .png, .jpg, .pdf or .svg."),
-                click.option("--force", is_flag=True, help="Replace files that exist."),
-            )
-        ):  # fmt: skip
-            function = option(function)
-        return function
-
-    return decorate
+def _shared(estimators: tuple[str, ...], threshold: str) -> Option:
+    return together(
+        click.argument("image0", type=click.Path()),
+        click.argument("image1", type=click.Path()),
+        click.option("--detector", default="rootsift", show_default=True,
+                     type=click.Choice(("rootsift", "sift", "orb")), help="What finds keypoints."),
+        click.option("--keypoints", metavar="N", default=2000, show_default=True,
+                     type=click.IntRange(8, 100_000), help="Most keypoints of an image."),
+        click.option("--matches", type=click.Choice(("distinct", "loose", "mutual", "all")),
+                     help="Which nearest neighbours go to the estimator: mutual ones that pass the ratio test "
+                     "at 0.8 or, loosely, at 0.95, all mutual ones, or all. [distinct; loose with --weights]"),
+        click.option("--weights", metavar="FILE",
+                     help="Network that rejects wrong matches (.safetensors, see configs/train/images)."),
+        click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators),
+                     help="What fits the matches that are right and rejects the others."),
+        click.option("--threshold", metavar="PIXELS", type=click.FloatRange(min=0, min_open=True),
+                     help=f"Inlier threshold. [{threshold}]"),
+        click.option("--seed", metavar="N", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1),
+                     help="Random seed: the same seed, the same answers."),
+        click.option("--output", metavar="FILE.json", help="Write the answer as JSON."),
+        click.option("--picture", metavar="FILE", help="Draw the matches: .png, .jpg, .pdf or .svg."),
+        click.option("--force", is_flag=True, help="Replace files that exist."),
+    )  # fmt: skip
 
 
-@click.command(context_settings=HELP)
+@click.command(
+    cls=Verb, context_settings=HELP, short_help="Find how the cameras of two photographs lie to each other."
+)
 @_shared(("magsac", "ransac", "eight_point"), "1/800 of the image's longer side")
 @click.option("--intrinsics", metavar="FX,FY,CX,CY",
               help="Of both cameras, pixels; four distortions k1,k2,p1,p2 may follow; or a folder of photographs "
@@ -96,7 +89,9 @@ def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str 
     )  # fmt: skip
 
 
-@click.command(context_settings=HELP)
+@click.command(
+    cls=Verb, context_settings=HELP, short_help="Find the homography between two photographs of a plane."
+)
 @_shared(("magsac", "ransac", "dlt"), "3")
 @traceback_option
 @click.pass_context

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import check_outputs, part_option
 from geomoe3d.cli.parts import configuration_options, scale_option, sensor_place, unit_option
 
@@ -33,7 +33,7 @@ class _Outputs:
     unit: str
 
 
-@click.command(context_settings=HELP, short_help="Register one scan to another, and say how sure.")
+@click.command(cls=Verb, context_settings=HELP, short_help="Register one scan to another, and say how sure.")
 @click.argument("source", metavar="SOURCE")
 @click.argument("target", metavar="TARGET")
 @configuration_options
@@ -43,29 +43,35 @@ class _Outputs:
     metavar="FILE",
     help="Trained network (.safetensors) that scores transforms or rejects outliers.",
 )
-@click.option("--correspondences", metavar="FILE", help="Matches of your own: 6 columns, .txt, .csv or .npy.")
+@click.option(
+    "--correspondences",
+    metavar="FILE",
+    help="Matching points of your own: x y z in SOURCE and in TARGET, six columns (.txt, .csv or .npy).",
+)
 @click.option("--initial", metavar="FILE", help="A first guess, in any format of --output.")
 @click.option(
     "--sensor-source",
     metavar="X,Y,Z",
-    help="Where SOURCE's sensor stood, file coordinates; none: no one sensor.",
+    help="Where the scanner of SOURCE stood, in the file's coordinates; 'none': at no single place. [found]",
 )
-@click.option("--sensor-target", metavar="X,Y,Z", help="The same of TARGET. [found from the scans]")
+@click.option("--sensor-target", metavar="X,Y,Z", help="The same for TARGET. [found]")
 @click.option("--inverse", is_flag=True, help="Give the transform that maps TARGET into SOURCE instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON and nothing else.")
 @click.option(
     "--output",
+    "transforms",
     metavar="[FORMAT:]FILE",
     multiple=True,
     help="Write the transform; repeatable. By suffix: .txt (rows, as CloudCompare takes them), .npy, .json "
     "(whole result), .yaml (tf), .tum, .kitti; by name: pdal:FILE, ros:FILE, quaternion:FILE, ...",
 )
-@click.option("--aligned", metavar="FILE", help="Write SOURCE at full resolution, moved into TARGET.")
+@click.option("--aligned", metavar="FILE", help="Write all points of SOURCE, moved to their place in TARGET.")
 @click.option(
     "--aligned-precision",
+    "precision",
     metavar="WHICH",
     default="auto",
-    help="Coordinates of PLY and PCD: auto, double, or single (floats about an origin). [auto]",
+    help="Digits of coordinates in PLY and PCD: double, single (fewer, about an origin) or auto. [auto]",
 )
 @click.option(
     "--distances",
@@ -75,20 +81,21 @@ class _Outputs:
 @part_option("reader")
 @part_option("writer")
 @click.option("--picture", metavar="FILE", help="Write a picture: .png, .pdf, .svg, ...")
-@click.option("--page", metavar="FILE", help="Write a web page to turn the clouds in: .html.")
-@click.option("--report", metavar="FILE", help="Write one sheet for a customer: .pdf.")
+@click.option("--page", metavar="FILE", help="Write a web page in which the clouds can be turned: .html.")
+@click.option("--report", metavar="FILE", help="Write a report of one page for a customer: .pdf.")
 @unit_option
 @click.option("--show", is_flag=True, help="Open a window with the aligned clouds; needs a screen.")
 @click.option("--force", is_flag=True, help="Replace output files that exist.")
 @click.option(
     "--quiet",
     is_flag=True,
-    help="No progress; the four rows of the matrix alone, and one line on stderr where it is not ok.",
+    help="Print the four rows of the matrix alone, and one line of warning where the status is not ok.",
 )
 @traceback_option
 @click.pass_context
 def command(
     context: click.Context,
+    /,
     source: str,
     target: str,
     config: RegistrationConfig,
@@ -99,17 +106,10 @@ def command(
     sensor_target: str | None,
     inverse: bool,
     as_json: bool,
-    output: tuple[str, ...],
-    aligned: str | None,
-    aligned_precision: str,
-    distances: bool,
-    picture: str | None,
-    page: str | None,
-    report: str | None,
-    unit: str,
     show: bool,
     force: bool,
     quiet: bool,
+    **wanted: Any,
 ) -> None:
     """Find the rigid transform that registers SOURCE to TARGET: p_target = R p_source + t.
 
@@ -119,8 +119,7 @@ def command(
     guess is needed. The transform is given in the files' own coordinates, with a status: ok,
     low_confidence, ambiguous or failed. Exit code 0 for ok, 3 for the others, 2 for unusable input.
     """
-
-    outputs = _Outputs(output, aligned, aligned_precision, distances, picture, page, report, unit)
+    outputs = _Outputs(**wanted)
     read = [source, target, *filter(None, (correspondences, initial, weights))]
     _check_outputs(outputs, read, None if config.scale == "estimate" else 1.0, force)
     if show:
@@ -137,21 +136,18 @@ def command(
         from geomoe3d.pipeline import with_weights
         from geomoe3d.registration import Registrar
 
-        guess = None if initial is None else load_transform(initial)
-        matches = None if correspondences is None else load_correspondences(correspondences)
         registrar = Registrar(config if weights is None else with_weights(config, weights))
-        sensors = (
-            sensor_place(sensor_source, "--sensor-source"),
-            sensor_place(sensor_target, "--sensor-target"),
-        )
         told: dict[str, Any] = {
-            "initial": guess,
-            "correspondences": matches,
-            "sensors": sensors,
+            "initial": None if initial is None else load_transform(initial),
+            "correspondences": None if correspondences is None else load_correspondences(correspondences),
+            "sensors": (
+                sensor_place(sensor_source, "--sensor-source"),
+                sensor_place(sensor_target, "--sensor-target"),
+            ),
             "progress": stage,
         }
         explanation: Explanation | None = None
-        if picture is not None or page is not None or report is not None or show:
+        if show or outputs.picture or outputs.page or outputs.report:
             explanation = registrar.explain(source, target, **told)
             result = explanation.result
         else:
@@ -160,11 +156,11 @@ def command(
         with stdout_to_stderr(), stage_display(quiet) as stage:
             _write(outputs, result, explanation, (source, target), inverse, force, stage)
     finally:  # a full disk must not cost the answer
-        _print(result.inverse() if inverse else result, as_json, quiet, inverse, unit)
+        _print(result.inverse() if inverse else result, as_json, quiet, inverse, outputs.unit)
     if show and explanation is not None:
         from geomoe3d.visual.window import show_window
 
-        show_window(explanation.view(unit))
+        show_window(explanation.view(outputs.unit))
     context.exit(0 if result.ok else ExitCode.NOT_SURE)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import click
 
-from geomoe3d.cli.errors import HELP, traceback_option
+from geomoe3d.cli.errors import HELP, Verb, traceback_option
 
 
-@click.command(context_settings=HELP)
+@click.command(cls=Verb, context_settings=HELP)
 @click.argument("folder", default="sample", metavar="[FOLDER]")
 @click.option(
     "--seed",

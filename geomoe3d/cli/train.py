@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, refuse_bare_settings, renamed, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, refuse_bare_settings, renamed, traceback_option
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.training.config import TrainConfig
 
 
-@click.command(context_settings=HELP)
+@click.command(cls=Verb, context_settings=HELP, short_help="Train a network.")
 @click.argument("config", type=click.Path())
 @click.argument("bare", nargs=-1, metavar="")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One setting; repeatable.")

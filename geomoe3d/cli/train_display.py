@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import click
@@ -34,9 +33,7 @@ class Display:
         self._advance = self._open.enter_context(progress_bar("steps", quiet=self._quiet))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._open.close()
 
     def started(self, config: TrainConfig, first_step: int, notes: list[str]) -> None:

@@ -21,9 +21,10 @@ from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
 from geomoe3d.data.fusion import measure_overlap
 from geomoe3d.data.shards import DescribedScene, is_shard, open_shard, why_stale, write_shard
 from geomoe3d.data.splits import split_of
-from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, OutputError
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
 from geomoe3d.features.base import with_features
 from geomoe3d.features.fpfh import FpfhDescriptor
+from geomoe3d.runtime.files import make_folder
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.types import Float32Array, PointCloud
 
@@ -96,10 +97,7 @@ def describe_collection(
         raise InputError(f"the voxel size must be a positive length, found {voxel_size}")
     collection = open_collection(root)
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    make_folder(folder)
     by_scene: dict[str, list[PosedPair]] = {}
     for pair in collection.pairs:
         if (groups is None or pair.group in groups) and (scenes is None or pair.scene in scenes):

@@ -18,6 +18,7 @@ from geomoe3d.data.rgbd import Frame, Recording, image_size, read_depth
 from geomoe3d.data.threedmatch import PairTable, write_gt_log, write_gt_overlap
 from geomoe3d.errors import GeoMoE3DError, InputError, OutputError
 from geomoe3d.geometry.se3 import inverse
+from geomoe3d.runtime.files import make_folder
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import Float32Array, FloatArray
 
@@ -77,12 +78,9 @@ def make_fragments(
         if not 0 < length < float("inf"):
             raise InputError(f"the {name} must be positive and finite, found {length}")
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise OutputError(f"'{folder}' holds files already; give a new folder")
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror or error}") from None
+    make_folder(folder)
+    if any(folder.iterdir()):
+        raise OutputError(f"'{folder}' holds files already; give a new folder")
     report = FragmentsReport(folder, skipped=list(recording.skipped))
     runs = split_runs(recording.frames, frames_per_fragment)
     size = image_size(recording)

@@ -20,7 +20,7 @@ from geomoe3d.data.rooms.sensor import Camera, cast
 from geomoe3d.data.rooms.solids import Solids
 from geomoe3d.data.rooms.walk import camera_pose as _camera_pose
 from geomoe3d.data.sample_room import furnished_room
-from geomoe3d.errors import InputError, OutputError
+from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.types import FloatArray, PointCloud
 
@@ -73,13 +73,10 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
     """
     from geomoe3d.clouds.io import save_points
     from geomoe3d.clouds.transform_files import save_transform
-    from geomoe3d.runtime.files import check_output
+    from geomoe3d.runtime.files import check_output, make_folder
 
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    make_folder(folder)
     paths = SamplePaths(folder / "source.ply", folder / "target.ply", folder / "T_target_source.txt")
     for path in (paths.source, paths.target, paths.truth):
         check_output(path, force=force)

@@ -12,7 +12,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from geomoe3d.data.rooms.scenes import load_mesh_scene
 from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.files import make_folder, refusals, write_text
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
@@ -99,8 +99,8 @@ def synthesize(
     seed: int = 0,
     workers: int = 1,
     settings: SynthesisSettings | None = None,
-    model_folders: list[str] | None = None,
-    meshes: list[str] | None = None,
+    model_folders: Sequence[str] | None = None,
+    meshes: Sequence[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SynthesisReport:
     """Make the scenes 0 to ``num_scenes`` - 1 that are not in the folder yet.
@@ -269,8 +269,8 @@ def _fingerprint(paths: list[Path]) -> str:
 
 def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
     """Make the folder or check that it belongs to the same set; clear what a killed run left."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with refusals(f"cannot write into '{folder}'"):
+        make_folder(folder)
         path = folder / MANIFEST
         if path.is_file():
             try:
@@ -289,10 +289,6 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
             write_text(path, json.dumps(manifest, indent=1) + "\n", force=False)
         for rest in folder.glob(f"{_WRITING}*"):
             shutil.rmtree(rest, ignore_errors=True)
-    except OSError as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(f"cannot write into '{folder}': {error.strerror or error}") from None
 
 
 def _completed(manifest: Any) -> dict[str, Any]:

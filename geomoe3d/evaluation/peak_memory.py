@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import TracebackType
 
 _RESET = "5"  # the value by which Linux sets the high-water mark back to the present size
 
@@ -25,12 +24,7 @@ class PeakMemory:
             self._can_reset = False
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if not self._can_reset:
             return
         try:

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.errors import FormatError, InputError
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
-from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.files import make_folder, remove, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.types import BoolArray, FloatArray
@@ -36,10 +36,7 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
         OutputError: the folder or its files cannot be written, or another process writes them.
         FormatError: a file in it is damaged.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    make_folder(folder)
     if (folder / RUN_FILE).is_file():
         differing = differences(_compared(read_info(folder)), _compared(info))
         if differing:
@@ -71,11 +68,7 @@ def remove_run(folder: Path) -> None:
     """
     if (folder / PREDICTIONS_FILE).is_file():
         Journal(folder / PREDICTIONS_FILE).close()  # refused while another process holds it
-    for name in (PREDICTIONS_FILE, RUN_FILE):
-        try:
-            (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot remove '{folder / name}': {error.strerror}") from None
+    remove(folder / name for name in (PREDICTIONS_FILE, RUN_FILE))
 
 
 def find_runs(study: Path) -> list[Path]:

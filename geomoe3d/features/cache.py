@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.config import PreparationConfig, expert
-from geomoe3d.errors import InputError, OutputError
+from geomoe3d.errors import InputError
 from geomoe3d.features.base import Descriptor
-from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.files import make_folder, write_atomically
 from geomoe3d.runtime.home import ensure_home, folder_for
 from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
 from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
@@ -75,10 +75,7 @@ class FeatureCache:
             raise InputError(f"a cache of at most {max_bytes} bytes holds nothing; give a positive limit")
         self.folder, self.max_bytes = Path(folder), max_bytes
         self._complained = False
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot make the folder '{folder}': {error.strerror}") from None
+        make_folder(self.folder)
 
     def fetch(
         self, cloud: PointCloud, identity: dict[str, Any], make: Callable[[], PreparedCloud]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.batch.folder import foreign, has_mark, remove, transform_name
+from geomoe3d.batch.folder import foreign, has_mark, transform_name
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.decision.answer import library_versions
@@ -28,7 +28,7 @@ from geomoe3d.multiway.tables import (
     edges_text,
     scans_text,
 )
-from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.files import remove, write_text
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 

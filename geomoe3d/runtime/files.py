@@ -11,7 +11,8 @@ import errno
 import hashlib
 import os
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from geomoe3d.errors import ExistingFileError, GeoMoE3DError, InputError, OutputError
@@ -131,6 +132,38 @@ def _move(temporary: Path, path: Path, *, force: bool) -> None:
         except (OSError, NotImplementedError, AttributeError):
             check_output(path, force=False)  # no hard links on this file system
     temporary.replace(path)
+
+
+@contextmanager
+def refusals(message: str) -> Iterator[None]:
+    """What the system refuses inside is an `OutputError`: the message, and the reason."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{message}: {_reason(error)}") from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder if it is not there, and those that it lies in.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    with refusals(f"cannot make the folder '{folder}'"):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+def remove(paths: Iterable[Path]) -> None:
+    """Delete files, if they are there.
+
+    Raises:
+        OutputError: one cannot be removed.
+    """
+    for path in paths:
+        with refusals(f"cannot remove '{path}'"):
+            path.unlink(missing_ok=True)
 
 
 def _reason(error: Exception) -> str:

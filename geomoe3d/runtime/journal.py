@@ -11,11 +11,12 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from geomoe3d.errors import FormatError, OutputError, cannot_read
+from geomoe3d.runtime.files import refusals
 
 
 def read_journal(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
@@ -62,14 +63,10 @@ class Journal:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        try:
+        with self._writing():
             self._stream: IO[bytes] = self.path.open("a+b")
             _lock(self._stream, self.path)
             _cut_torn_line(self._stream)
-        except OutputError:
-            raise
-        except OSError as error:
-            raise OutputError(f"cannot write '{self.path}': {error.strerror}") from None
         self._synced = time.monotonic()
 
     def append(self, record: dict[str, Any]) -> None:
@@ -80,23 +77,23 @@ class Journal:
             ValueError: the record holds a NaN or infinite number, which JSON does not have.
         """
         line = json.dumps(record, allow_nan=False, separators=(",", ":")).encode() + b"\n"
-        try:
+        with self._writing():
             self._stream.write(line)
             self._stream.flush()
             if time.monotonic() - self._synced > 1.0:  # s
                 self._sync()
-        except OSError as error:
-            raise OutputError(f"cannot write '{self.path}': {error.strerror}") from None
 
     def close(self) -> None:
         """Bring everything to the disk and let go of the file."""
         if not self._stream.closed:
             try:
-                self._sync()
-            except OSError as error:
-                raise OutputError(f"cannot write '{self.path}': {error.strerror}") from None
+                with self._writing():
+                    self._sync()
             finally:
                 self._stream.close()
+
+    def _writing(self) -> AbstractContextManager[None]:
+        return refusals(f"cannot write '{self.path}'")
 
     def _sync(self) -> None:
         os.fsync(self._stream.fileno())
@@ -105,12 +102,7 @@ class Journal:
     def __enter__(self) -> Journal:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 

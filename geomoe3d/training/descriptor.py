@@ -21,9 +21,9 @@ from pydantic import Field
 from torch import Tensor
 
 from geomoe3d.config import Section
-from geomoe3d.errors import CheckpointError, OutputError
+from geomoe3d.errors import CheckpointError
 from geomoe3d.features.learned import LEARNED, load_tensors
-from geomoe3d.runtime.files import write_atomically, write_text
+from geomoe3d.runtime.files import make_folder, write_atomically, write_text
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.training.descriptor_network import DescriptorNetwork
 from geomoe3d.training.descriptor_pairs import ContrastBatch, ContrastPairs
@@ -94,10 +94,7 @@ class DescriptorRun:
 
     def __init__(self, config: DescriptorTrainConfig, folder: Path) -> None:
         self.config, self.folder = config, folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot use '{folder}' as run folder: {error.strerror}") from None
+        make_folder(folder)
         torch.manual_seed(config.seed)
         self.device = choose_device(config.device, Process())
         self.network = DescriptorNetwork(config.width).to(self.device)

@@ -23,7 +23,7 @@ from geomoe3d.errors import InputError, OutputError
 from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
-from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.files import make_folder, write_text
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.training.config import RULES
 from geomoe3d.training.fragment_pairs import as_training_pair
@@ -77,10 +77,7 @@ def propose_motions(
     """
     pool_identity = FragmentPool(features, SETTINGS, seed, verify=True).identity()
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder '{out}': {error.strerror}") from None
+    make_folder(out)
     _check_identity(
         out / _IDENTITY,
         {"seed": seed, "motions": RULES.num_transforms, "proposer": PROPOSER_VERSION, "pool": pool_identity},

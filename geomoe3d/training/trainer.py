@@ -23,7 +23,7 @@ from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
 from geomoe3d.networks.build import Network, build_network
 from geomoe3d.networks.pretrained import load_network, save_pretrained
 from geomoe3d.networks.weight_files import WeightCard
-from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.files import make_folder, write_text
 from geomoe3d.runtime.provenance import source_commit
 from geomoe3d.runtime.words import counted
 from geomoe3d.training.batches import Batch, open_training, training_loader, validation_samples
@@ -267,10 +267,7 @@ class TrainingRun:
         return path
 
     def _open_folder(self, fresh: bool) -> None:
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot use '{self.folder}' as run folder: {error.strerror}") from None
+        make_folder(self.folder)
         if fresh and self.last_path.exists():
             raise OutputError(f"'{self.folder}' holds a run already; give another folder, or leave out --new")
         if not self.last_path.exists() and (self.folder / "weights.safetensors").exists():

@@ -229,11 +229,8 @@ def localised(rows: FloatArray) -> tuple[Correspondences, tuple[FloatArray, Floa
 def between_clouds(
     correspondences: ArrayLike | Correspondences, clouds: tuple[PreparedCloud, PreparedCloud]
 ) -> Correspondences:
-    """A user's rows (N, 6), file coordinates, in the clouds' local ones, with the normals of the nearest points.
-
-    Raises:
-        InputError: no (N, 6) of finite numbers.
-    """
+    """A user's rows (N, 6), file coordinates, in the clouds' local ones, with the normals of the nearest
+    points. Raises InputError: no (N, 6) of finite numbers."""
     from scipy.spatial import cKDTree
 
     rows = check_rows(correspondences)
@@ -267,11 +264,7 @@ def likeliest_rows(correspondences: Correspondences, limit: int, cell: float, se
 
 
 def check_rows(correspondences: ArrayLike | Correspondences) -> FloatArray:
-    """(N, 6) finite float64.
-
-    Raises:
-        InputError: something else.
-    """
+    """(N, 6) finite float64. Raises InputError: something else."""
     if isinstance(correspondences, Correspondences):
         correspondences = correspondences.points
     try:
@@ -291,11 +284,7 @@ def check_rows(correspondences: ArrayLike | Correspondences) -> FloatArray:
 
 
 def check_length(value: float, name: str) -> float:
-    """A positive finite length.
-
-    Raises:
-        InputError: something else.
-    """
+    """A positive finite length. Raises InputError: something else."""
     try:
         length = float(value)
     except (TypeError, ValueError):

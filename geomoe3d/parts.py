@@ -40,11 +40,8 @@ class Part(ABC):  # noqa: B024 - what is abstract differs from kind to kind
 
     @classmethod
     def from_config(cls, config: Any) -> Self:
-        """Made from its section of the configuration: ``options`` become keyword arguments.
-
-        Raises:
-            ConfigError: options that it does not take.
-        """
+        """Made from its section of the configuration: ``options`` become keyword arguments. Raises
+        ConfigError: options that it does not take."""
         options = dict(config.options)
         try:
             inspect.signature(cls).bind(**options)
@@ -132,11 +129,8 @@ class Registry(Generic[PartType]):
         )
 
     def make(self, config: PartConfig) -> PartType:
-        """The part that a section of the configuration names, with its settings.
-
-        Raises:
-            ConfigError: as `find`, or settings that it does not take.
-        """
+        """The part that a section of the configuration names, with its settings. Raises ConfigError: as
+        `find`, or settings that it does not take."""
         part = self.find(config.name)
         own = part.from_config.__func__ is Part.from_config.__func__  # type: ignore[attr-defined]
         if config.options and not own and ":" not in config.name:

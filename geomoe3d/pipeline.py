@@ -196,11 +196,8 @@ class Pipeline:
         return source, replace(clouds[1], viewpoint=None)
 
     def described_again(self, clouds: Clouds, clock: StageClock) -> Clouds:
-        """Both clouds with what the second descriptor says of them.
-
-        Raises:
-            ValueError: there is no second descriptor.
-        """
+        """Both clouds with what the second descriptor says of them. Raises ValueError: there is no second
+        descriptor."""
         if self.second_descriptor is None:
             raise ValueError("there is no second descriptor")
         clock("features")
@@ -271,10 +268,7 @@ class Pipeline:
 
 def resolved(config: RegistrationConfig | None) -> RegistrationConfig:
     """The configuration, None for the defaults, with ``auto`` replaced by what it means on this machine.
-
-    Raises:
-        ConfigError: something else than a configuration.
-    """
+    Raises ConfigError: something else than a configuration."""
     config = RegistrationConfig() if config is None else config
     if not isinstance(config, RegistrationConfig):
         raise ConfigError(

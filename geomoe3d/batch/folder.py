@@ -36,11 +36,8 @@ _TRANSFORM_HEAD = re.compile(  # the rows stand behind the remarks in batches of
 
 
 def read_identity(folder: Path) -> dict[str, Any] | None:
-    """What the answers of the batch in a folder depend on; None where no batch was begun.
-
-    Raises:
-        FormatError: its ``run.json`` is damaged, or of something else.
-    """
+    """What the answers of the batch in a folder depend on; None where no batch was begun. Raises FormatError:
+    its ``run.json`` is damaged, or of something else."""
     path = folder / RUN_FILE
     try:
         identity = dict(json.loads(path.read_text(encoding="utf-8"))["identity"])
@@ -130,11 +127,8 @@ def has_mark(path: Path, mark: str) -> bool:
 
 def remove_batch(folder: Path) -> None:
     """Delete what a batch left of its own; nothing else in the folder is touched, nor what is no batch.
-
-    Raises:
-        FormatError: as `read_identity`.
-        OutputError: a file cannot be removed, or another process is writing the journal.
-    """
+    Raises FormatError: as `read_identity`; OutputError: a file cannot be removed, or another process is
+    writing the journal."""
     if read_identity(folder) is None:
         return
     if (folder / JOURNAL_FILE).is_file():

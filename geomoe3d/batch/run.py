@@ -135,11 +135,8 @@ class Labour:
 
 
 def try_out(pool: Pool, settings: Settings) -> None:
-    """Let a worker make ready, so that what it refuses is known before anything is written or removed.
-
-    Raises:
-        OutputError: it died. What it refuses passes through, see `geomoe3d.batch.task.make_ready`.
-    """
+    """Let a worker make ready, so that what it refuses is known before anything is written or removed. Raises
+    OutputError: it died. What it refuses passes through, see `geomoe3d.batch.task.make_ready`."""
     try:
         pool.open().submit(make_ready, settings).result()
     except Exception as error:

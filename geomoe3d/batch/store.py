@@ -172,11 +172,7 @@ class BatchStore:
         return {name: record for name, record in found.items() if record.get("error") is None}
 
     def outcome(self, record: dict[str, Any]) -> Outcome:
-        """A record as a result that can be used.
-
-        Raises:
-            FormatError: the record is damaged.
-        """
+        """A record as a result that can be used. Raises FormatError: the record is damaged."""
         try:
             name, plain, error = str(record["id"]), record["result"], record["error"]
             if plain is None:

@@ -108,11 +108,8 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
 
 
 def as_rows(pairs: Iterable[PairLike | PairRow]) -> list[PairRow]:
-    """Rows of (source path, target path) or (source, target, first guess (4, 4)) in memory.
-
-    Raises:
-        InputError: none, a duplicate, or something else than paths; a batch sends paths to its workers.
-    """
+    """Rows of (source path, target path) or (source, target, first guess (4, 4)) in memory. Raises
+    InputError: none, a duplicate, or something else than paths; a batch sends paths to its workers."""
     numbers = getattr(getattr(pairs, "dtype", None), "kind", "O") not in "OSU"  # an array may hold paths too
     if numbers or isinstance(pairs, (bytes, Mapping)) or not isinstance(pairs, Iterable):
         raise InputError(
@@ -156,11 +153,7 @@ def kind_of(value: Any) -> str:
 
 
 def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow]:
-    """The rows, if there are any and no two share an id.
-
-    Raises:
-        InputError: none, or two.
-    """
+    """The rows, if there are any and no two share an id. Raises InputError: none, or two."""
     if not rows:
         raise InputError(f"{what} holds no pairs; give at least one row with source and target")
     seen: dict[str, str] = {}
@@ -175,11 +168,8 @@ def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow
 
 
 def _check_id(name: str, where: str) -> None:
-    """An id names files: it is no path out of their folder, and hides none.
-
-    Raises:
-        InputError: it begins with a dot, or holds the part ``..``.
-    """
+    """An id names files: it is no path out of their folder, and hides none. Raises InputError: it begins with
+    a dot, or holds the part ``..``."""
     if name.startswith(".") or ".." in name.replace("\\", "/").split("/"):
         raise InputError(
             f"{where}: the id '{name}' cannot name files: it must not begin with a dot nor hold the part '..'; "

@@ -58,11 +58,8 @@ class Task:
 
 
 def register_pair(task: Task) -> dict[str, Any]:
-    """One pair registered: a record with a result, or with the reason why there is none.
-
-    Raises:
-        DependencyError: this worker's libraries are other than those of the process that asks.
-    """
+    """One pair registered: a record with a result, or with the reason why there is none. Raises
+    DependencyError: this worker's libraries are other than those of the process that asks."""
     registrar = _registrar(task.settings)
     row = task.row
     result, error = None, None
@@ -78,12 +75,8 @@ def register_pair(task: Task) -> dict[str, Any]:
 
 
 def make_ready(settings: Settings) -> None:
-    """Have the registrar here that the tasks will need.
-
-    Raises:
-        ConfigError, CheckpointError, DependencyError: as `Registrar`, or this worker's libraries are other
-            than those of the process that asks.
-    """
+    """Have the registrar here that the tasks will need. Raises ConfigError, CheckpointError, DependencyError:
+    as `Registrar`, or this worker's libraries are other than those of the process that asks."""
     _registrar(settings)
 
 

@@ -102,11 +102,8 @@ def sensor_place(text: str | None, option: str) -> Any:
 
 
 def _assign_parts(named: dict[str, Any]) -> None:
-    """Parts as assignments; that there are such parts is seen before anything is read.
-
-    Raises:
-        ConfigError: there is none of a name.
-    """
+    """Parts as assignments; that there are such parts is seen before anything is read. Raises ConfigError:
+    there is none of a name."""
     given = [(option, key, named.pop(f"part_{option}")) for option, key, _ in _PARTS]
     given = [(option, key, value) for option, key, value in given if value is not None]
     scorers = named.pop("part_scorers")

@@ -12,11 +12,7 @@ from geomoe3d.types import FloatArray
 
 def load_correspondences(path: str | Path) -> FloatArray:
     """(N, 6) rows [source xyz, target xyz] of an .npy file, or of text with blanks or commas between numbers.
-
-    Raises:
-        InputError: missing or unreadable.
-        FormatError: another number of columns than six.
-    """
+    Raises InputError: missing or unreadable; FormatError: another number of columns than six."""
     place = Path(path)
     try:
         if place.suffix.lower() == ".npy":

@@ -62,11 +62,8 @@ class Inputs:
         return replace(self, correspondences=rows, **both)
 
     def clouds(self, source: Any, target: Any, seed: int) -> tuple[PointCloud, PointCloud]:
-        """Both clouds loaded again; a given one takes the place of the one remembered.
-
-        Raises:
-            InputError: a cloud that is neither remembered nor given, or that has changed since.
-        """
+        """Both clouds loaded again; a given one takes the place of the one remembered. Raises InputError: a
+        cloud that is neither remembered nor given, or that has changed since."""
         loaded = []
         for role, given, kept, mark in zip(
             ("source", "target"), (source, target), (self.source, self.target), self.marks, strict=True

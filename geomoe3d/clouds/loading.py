@@ -115,10 +115,7 @@ def load_points(
 
 def _checked(cloud: PointCloud) -> PointCloud:
     """The cloud itself, or a copy with what all that follows relies on: finite float64 rows without gaps.
-
-    Raises:
-        InputError, EmptyCloudError, NonFiniteError: as `load_points`.
-    """
+    Raises InputError, EmptyCloudError, NonFiniteError: as `load_points`."""
     what, points = f"'{cloud.name}'", cloud.points
     whole = isinstance(points, np.ndarray) and points.dtype == np.float64 and points.flags.c_contiguous
     if not (whole and points.ndim == 2 and points.shape[1] == 3):
@@ -149,11 +146,8 @@ def is_sampled(data: Any, raw: RawCloud) -> bool:
 
 
 def read_raw(data: Any) -> RawCloud:
-    """Everything `load_points` accepts, in file coordinates, nothing dropped, meshes with their faces.
-
-    Raises:
-        InputError, FormatError, EmptyCloudError, DependencyError: as `load_points`.
-    """
+    """Everything `load_points` accepts, in file coordinates, nothing dropped, meshes with their faces. Raises
+    InputError, FormatError, EmptyCloudError, DependencyError: as `load_points`."""
     if isinstance(data, PointCloud):
         return RawCloud(data.file_points, data.normals, data.colors, sensor=data.sensor)
     if not _is_path(data):
@@ -196,10 +190,7 @@ def _raw(read: Any) -> RawCloud:
 @contextmanager
 def _unpacked(path: Path) -> Iterator[Path]:
     """A temporary copy of a gzip file's content, under its name without .gz; messages name the file itself.
-
-    Raises:
-        FormatError: no gzip file, damaged, or unpacking to more than 200 times its size.
-    """
+    Raises FormatError: no gzip file, damaged, or unpacking to more than 200 times its size."""
     ensure_home()
     try:
         tempfile.gettempdir()

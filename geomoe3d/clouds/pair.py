@@ -31,11 +31,7 @@ class Pair:
 
     @property
     def clouds(self) -> tuple[PreparedCloud, PreparedCloud]:
-        """Source and target.
-
-        Raises:
-            ValueError: only the correspondences are known.
-        """
+        """Source and target. Raises ValueError: only the correspondences are known."""
         if self.source is None or self.target is None:
             raise ValueError("this pair has correspondences and no clouds")
         return self.source, self.target

@@ -117,11 +117,8 @@ def own_voxel_sizes(source: PointCloud, target: PointCloud, num_points: int) -> 
 
 
 def check_cloud(cloud: PointCloud) -> None:
-    """Refuse a cloud that cannot fix a rigid motion whatever the other one is.
-
-    Raises:
-        EmptyCloudError: fewer than 3 points, or all points equal.
-    """
+    """Refuse a cloud that cannot fix a rigid motion whatever the other one is. Raises EmptyCloudError: fewer
+    than 3 points, or all points equal."""
     if len(cloud) < _MIN_POINTS:
         held = f"'{cloud.name}' holds {counted(len(cloud), 'point')}"
         raise EmptyCloudError(f"{held}; a rigid transform needs at least {_MIN_POINTS}")
@@ -143,10 +140,7 @@ def robust_extent(points: FloatArray) -> float:
 
 def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float, max_points: int) -> float:
     """The given size, or the next larger at which neither cloud occupies more than ``max_points`` voxels.
-
-    Raises:
-        InputError: a voxel so small that the grid's indices overflow.
-    """
+    Raises InputError: a voxel so small that the grid's indices overflow."""
     for cloud in (source, target):
         while (occupied := _num_different(voxel_keys(cloud.points, voxel_size, OFF_ROUND))) > max_points:
             # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
@@ -278,11 +272,8 @@ def drop_duplicates(points: FloatArray) -> tuple[FloatArray, int]:
 
 
 def voxel_keys(points: FloatArray, voxel_size: float, shift: float = 0.0) -> IntArray:
-    """One integer per point that names its voxel on a grid with a corner ``shift`` voxels from the local origin.
-
-    Raises:
-        InputError: the cloud spans more than 2^21 voxels along an axis.
-    """
+    """One integer per point that names its voxel on a grid with a corner ``shift`` voxels from the local
+    origin. Raises InputError: the cloud spans more than 2^21 voxels along an axis."""
     limit = 2**21  # of a 64-bit voxel key, for each axis, at most
     first, last = (np.floor(corner / voxel_size - shift) for corner in bounds(points))
     if (last - first).max() >= limit:

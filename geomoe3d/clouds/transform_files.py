@@ -162,11 +162,7 @@ def has_transform(result: RegistrationResult) -> bool:
 
 
 def check_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...], more: str = "") -> str:
-    """The lower-case suffix of a path.
-
-    Raises:
-        FormatError: it is none of ``suffixes``.
-    """
+    """The lower-case suffix of a path. Raises FormatError: it is none of ``suffixes``."""
     suffix = Path(path).suffix.lower()
     if suffix not in suffixes:
         found = f"suffix '{suffix}'" if suffix else "no suffix"

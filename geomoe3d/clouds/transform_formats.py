@@ -101,12 +101,8 @@ TEXTS: dict[str, Callable[[FloatArray, Sequence[str], tuple[str, str]], str]] = 
 
 
 def parse_transform(text: str) -> FloatArray:
-    """The transform (4, 4) of a text: any of `TEXTS`, a result as JSON, or a bare matrix.
-
-    Raises:
-        FormatError: nothing that is understood, or more than one transform.
-        InputError: a result without a transform.
-    """
+    """The transform (4, 4) of a text: any of `TEXTS`, a result as JSON, or a bare matrix. Raises FormatError:
+    nothing that is understood, or more than one transform; InputError: a result without a transform."""
     if text.lstrip()[:1] in ("{", "["):
         try:
             return _of_document(json.loads(text))
@@ -154,11 +150,7 @@ def _of_rows(rows: list[list[float]], remarks: str) -> FloatArray:
 
 
 def of_matrix(values: FloatArray) -> FloatArray:
-    """(4, 4) from (4, 4), (3, 4), or these row after row.
-
-    Raises:
-        FormatError: another number of values.
-    """
+    """(4, 4) from (4, 4), (3, 4), or these row after row. Raises FormatError: another number of values."""
     if values.size not in (12, 16) or (values.ndim == 2 and values.shape[1] != 4 and values.shape[0] != 1):
         raise FormatError(f"numbers of shape {values.shape}, expected (4, 4)")
     T = np.eye(4)

@@ -98,11 +98,8 @@ def with_sensor(
 
 
 def check_both_known(clouds: tuple[PointCloud, PointCloud]) -> None:
-    """Refuse the place of one sensor, given by the user, where that of the other cloud is not known.
-
-    Raises:
-        InputError: normals of both must be turned by one rule, so that place would be of no use.
-    """
+    """Refuse the place of one sensor, given by the user, where that of the other cloud is not known. Raises
+    InputError: normals of both must be turned by one rule, so that place would be of no use."""
     for one, other in (clouds, clouds[::-1]):
         if one.sensor_given and one.sensor is not None and _believed(other) is None:
             raise InputError(

@@ -62,11 +62,8 @@ def build_config(section: type[S], tree: dict[str, Any] | None, where: str = "co
 
 
 def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
-    """Apply ``a.b=value`` strings (value parsed as YAML) to a copy of a nested mapping.
-
-    Raises:
-        ConfigError: an assignment without ``=`` or through a key that is no section.
-    """
+    """Apply ``a.b=value`` strings (value parsed as YAML) to a copy of a nested mapping. Raises ConfigError:
+    an assignment without ``=`` or through a key that is no section."""
     import copy
 
     import yaml
@@ -92,10 +89,7 @@ def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read one YAML mapping; ``configs/...`` are those that come with the package, wherever it is called.
-
-    Raises:
-        ConfigError: the file is missing, unreadable, no YAML, or holds no mapping.
-    """
+    Raises ConfigError: the file is missing, unreadable, no YAML, or holds no mapping."""
     import yaml
 
     try:

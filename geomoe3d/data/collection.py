@@ -81,11 +81,8 @@ class Collection:
 
 
 def open_collection(root: str | Path) -> Collection:
-    """List the fragments and pairs of a folder, whichever known layout it has.
-
-    Raises:
-        InputError: no such folder, or no layout fits; the message says what was looked for.
-    """
+    """List the fragments and pairs of a folder, whichever known layout it has. Raises InputError: no such
+    folder, or no layout fits; the message says what was looked for."""
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"'{root}' is not a folder")
@@ -109,11 +106,8 @@ def open_collection(root: str | Path) -> Collection:
 
 
 def load_fragment(path: str | Path) -> PointCloud:
-    """The points of a fragment of any layout, metres, in the fragment's own frame.
-
-    Raises:
-        InputError: missing, unreadable or empty; every reader's own errors are of this kind.
-    """
+    """The points of a fragment of any layout, metres, in the fragment's own frame. Raises InputError:
+    missing, unreadable or empty; every reader's own errors are of this kind."""
     from geomoe3d.clouds.io import load_points
 
     path = Path(path)

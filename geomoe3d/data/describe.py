@@ -52,10 +52,7 @@ class DescribeReport:
 
 def describe_fragment(cloud: PointCloud, voxel_size: float = 0.05) -> tuple[Float32Array, Float32Array]:
     """Voxel points (n, 3) and unit features (n, 33) float32 of a fragment whose sensor is at its origin.
-
-    Raises:
-        EmptyCloudError: fewer than 3 voxels.
-    """
+    Raises EmptyCloudError: fewer than 3 voxels."""
     config = PreparationConfig()
     prepared = with_features(prepare(cloud, voxel_size, config, viewpoint=-cloud.origin), FpfhDescriptor())
     assert prepared.features is not None

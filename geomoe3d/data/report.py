@@ -48,9 +48,5 @@ def report_text(report: SynthesisReport) -> str:
 
 
 def write_report(report: SynthesisReport, path: Path) -> None:
-    """Write report.md, replacing that of an earlier run.
-
-    Raises:
-        OutputError: the disk refuses.
-    """
+    """Write report.md, replacing that of an earlier run. Raises OutputError: the disk refuses."""
     write_text(path, report_text(report), force=True)

@@ -102,12 +102,8 @@ def open_recording(
 
 
 def read_depth(recording: Recording, frame: Frame) -> Float32Array:
-    """Depth (H, W) float32 in metres, 0 where nothing was measured.
-
-    Raises:
-        FormatError: the file is no single-channel 16-bit image, or is damaged.
-        InputError: it does not exist.
-    """
+    """Depth (H, W) float32 in metres, 0 where nothing was measured. Raises FormatError: the file is no
+    single-channel 16-bit image, or is damaged; InputError: it does not exist."""
     from PIL import Image
 
     try:

@@ -30,12 +30,9 @@ _NUMERIC_MODULES = ("numpy.core.numeric", "numpy._core.numeric")
 
 
 def load_pickle(path: str | Path) -> Any:
-    """The object of a pickle, or of a torch file that holds numpy arrays only.
-
-    Raises:
-        InputError: the file cannot be opened.
-        FormatError: it is no pickle, is cut short, or names anything beyond numpy arrays and containers.
-    """
+    """The object of a pickle, or of a torch file that holds numpy arrays only. Raises InputError: the file
+    cannot be opened; FormatError: it is no pickle, is cut short, or names anything beyond numpy arrays and
+    containers."""
     path = Path(path)
     try:
         if zipfile.is_zipfile(path):

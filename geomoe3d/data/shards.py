@@ -112,11 +112,7 @@ def is_shard(folder: Path) -> bool:
 
 
 def read_meta(folder: str | Path) -> dict[str, Any]:
-    """What a shard says about itself.
-
-    Raises:
-        FormatError: shard.json is missing or damaged.
-    """
+    """What a shard says about itself. Raises FormatError: shard.json is missing or damaged."""
     path = Path(folder) / _META
     try:
         meta = json.loads(path.read_text())
@@ -128,11 +124,8 @@ def read_meta(folder: str | Path) -> dict[str, Any]:
 
 
 def why_stale(folder: str | Path, settings: dict[str, Any], source: str | None = None) -> str | None:
-    """The reason why a shard does not fit settings or source files any more, or None if it does.
-
-    Raises:
-        FormatError: as `read_meta`.
-    """
+    """The reason why a shard does not fit settings or source files any more, or None if it does. Raises
+    FormatError: as `read_meta`."""
     meta = read_meta(folder)
     if meta["version"] != SHARD_VERSION:
         return f"version {meta['version']}, this is version {SHARD_VERSION}"
@@ -189,11 +182,7 @@ def _check(folder: Path, arrays: dict[str, Any]) -> None:
 
 
 def shard_folders(folder: str | Path) -> list[Path]:
-    """Shards of a folder by name.
-
-    Raises:
-        InputError: no such folder, or it holds none.
-    """
+    """Shards of a folder by name. Raises InputError: no such folder, or it holds none."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"'{folder}' is not a folder")

@@ -160,11 +160,8 @@ def scene_name(number: int) -> str:
 
 
 def make_scene(job: Job, number: int) -> SceneSummary:
-    """Make one scene and put it into the folder, completely or not at all.
-
-    Raises:
-        OutputError: the disk refuses; nothing but a hidden rest is left then, which the next run removes.
-    """
+    """Make one scene and put it into the folder, completely or not at all. Raises OutputError: the disk
+    refuses; nothing but a hidden rest is left then, which the next run removes."""
     from geomoe3d.clouds.io import save_points
 
     library = _open_library(job)
@@ -209,11 +206,8 @@ def make_scene(job: Job, number: int) -> SceneSummary:
 
 
 def read_summary(folder: Path) -> SceneSummary:
-    """Summary of a scene that is there.
-
-    Raises:
-        InputError: scene.json is missing or damaged; removing the scene's folder makes it anew.
-    """
+    """Summary of a scene that is there. Raises InputError: scene.json is missing or damaged; removing the
+    scene's folder makes it anew."""
     try:
         return SceneSummary(**json.loads((folder / "scene.json").read_text()))
     except (OSError, ValueError, TypeError) as error:

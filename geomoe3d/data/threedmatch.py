@@ -75,11 +75,8 @@ class FixedCorrespondences:
 
 
 def find_data_root() -> Path:
-    """The folder of real scans: ``GEOMOE3D_DATA``, else ``../shared/data`` beside the checkout.
-
-    Raises:
-        InputError: neither is a folder.
-    """
+    """The folder of real scans: ``GEOMOE3D_DATA``, else ``../shared/data`` beside the checkout. Raises
+    InputError: neither is a folder."""
     given = os.environ.get(DATA_VARIABLE)
     if given:
         if Path(given).is_dir():
@@ -123,22 +120,14 @@ def read_gt_log(path: str | Path) -> PairTable:
 
 
 def read_gt_info(path: str | Path) -> PairTable:
-    """Entries (i, j, I) of a gt.info in file order; I (6, 6) weighs the benchmark's RMSE.
-
-    Raises:
-        InputError: the file cannot be read.
-        FormatError: an entry is cut short or holds no numbers; names the line.
-    """
+    """Entries (i, j, I) of a gt.info in file order; I (6, 6) weighs the benchmark's RMSE. Raises InputError:
+    the file cannot be read; FormatError: an entry is cut short or holds no numbers; names the line."""
     return _read_blocks(Path(path), 6)
 
 
 def read_gt_overlap(path: str | Path) -> dict[tuple[int, int], float]:
-    """Overlap in [0, 1] of every listed pair (i, j), i < j as in the file.
-
-    Raises:
-        InputError: the file cannot be read.
-        FormatError: a line is not ``i,j,overlap``; names the line.
-    """
+    """Overlap in [0, 1] of every listed pair (i, j), i < j as in the file. Raises InputError: the file cannot
+    be read; FormatError: a line is not ``i,j,overlap``; names the line."""
     overlaps: dict[tuple[int, int], float] = {}
     for number, line in enumerate(_lines(Path(path)), start=1):
         if not line.strip():
@@ -156,11 +145,8 @@ def read_gt_overlap(path: str | Path) -> dict[tuple[int, int], float]:
 
 
 def write_gt_log(path: str | Path, entries: PairTable, num_fragments: int) -> None:
-    """Write entries (i, j, T), T mapping j into i, with all digits of a double.
-
-    Raises:
-        OutputError: the file exists, or the disk refuses.
-    """
+    """Write entries (i, j, T), T mapping j into i, with all digits of a double. Raises OutputError: the file
+    exists, or the disk refuses."""
     lines = []
     for i, j, T in entries:
         lines.append(f"{i}\t{j}\t{num_fragments}")
@@ -170,11 +156,7 @@ def write_gt_log(path: str | Path, entries: PairTable, num_fragments: int) -> No
 
 
 def write_gt_overlap(path: str | Path, overlaps: dict[tuple[int, int], float]) -> None:
-    """Write ``i,j,overlap`` lines, four digits.
-
-    Raises:
-        OutputError: the file exists, or the disk refuses.
-    """
+    """Write ``i,j,overlap`` lines, four digits. Raises OutputError: the file exists, or the disk refuses."""
     text = "".join(f"{i},{j},{value:.4f}\n" for (i, j), value in sorted(overlaps.items()))
     write_text(path, text, force=False)
 
@@ -256,11 +238,8 @@ def iterate_fixed_correspondences(
 
 
 def load_fixed_scene(file: str | Path) -> list[FixedCorrespondences]:
-    """The fixed correspondences of one scene, ``<scene>.npz``, pairs in gt.log order.
-
-    Raises:
-        FormatError: the file is missing, lacks an array or cannot be decoded.
-    """
+    """The fixed correspondences of one scene, ``<scene>.npz``, pairs in gt.log order. Raises FormatError: the
+    file is missing, lacks an array or cannot be decoded."""
     file = Path(file)
     try:
         with np.load(file, allow_pickle=False) as archive:

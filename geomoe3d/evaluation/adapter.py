@@ -79,11 +79,8 @@ class AdaptedFunction:
         return None
 
     def __call__(self, given: MethodInput) -> Answer:
-        """Call the function on copies of the pair's arrays and check what it returns.
-
-        Raises:
-            InputError: the function raised, or returned something that is no rigid transform.
-        """
+        """Call the function on copies of the pair's arrays and check what it returns. Raises InputError: the
+        function raised, or returned something that is no rigid transform."""
         if given.correspondences is not None:
             source, target = given.correspondences[:, :3].copy(), given.correspondences[:, 3:].copy()
         elif given.source is not None and given.target is not None:
@@ -105,10 +102,7 @@ class AdaptedFunction:
 
 def _motion(result: Any, who: str) -> FloatArray | None:
     """What a function returned as a rigid transform (4, 4); None and non-finite entries mean no answer.
-
-    Raises:
-        InputError: see `geomoe3d.geometry.se3.check_motion`; ``who`` begins the message.
-    """
+    Raises InputError: see `geomoe3d.geometry.se3.check_motion`; ``who`` begins the message."""
     if result is None:
         return None
     try:

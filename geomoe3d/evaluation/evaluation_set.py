@@ -52,12 +52,9 @@ class EvaluationSet:
 
 
 def load_run_pairs(info: RunInfo) -> list[EvaluationPair]:
-    """The pairs that a stored run was made on, with their truth, read again from the benchmark.
-
-    Raises:
-        InputError: the benchmark is not there any more, or its ground truth is another than the run saw.
-        FormatError: the run does not say what it was made on.
-    """
+    """The pairs that a stored run was made on, with their truth, read again from the benchmark. Raises
+    InputError: the benchmark is not there any more, or its ground truth is another than the run saw;
+    FormatError: the run does not say what it was made on."""
     try:
         given = info.identity["pairs"]
         chosen = EvaluationSet(

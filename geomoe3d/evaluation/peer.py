@@ -89,11 +89,8 @@ class Peer:
         return None
 
     def __call__(self, given: MethodInput) -> Answer:
-        """Register one pair; see `Method`.
-
-        Raises:
-            InputError: the pair comes without the input that this peer takes, or the library refuses it.
-        """
+        """Register one pair; see `Method`. Raises InputError: the pair comes without the input that this peer
+        takes, or the library refuses it."""
         if given.correspondences is not None and "correspondences" in self.inputs:
             source, target = given.correspondences[:, :3], given.correspondences[:, 3:]
         elif given.source is not None and given.target is not None and "clouds" in self.inputs:

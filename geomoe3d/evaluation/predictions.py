@@ -62,21 +62,14 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
 
 def remove_run(folder: Path) -> None:
     """Delete the predictions of a run and what it says of itself; nothing else in the folder is touched.
-
-    Raises:
-        OutputError: a file cannot be removed, or another process is writing the predictions.
-    """
+    Raises OutputError: a file cannot be removed, or another process is writing the predictions."""
     if (folder / PREDICTIONS_FILE).is_file():
         Journal(folder / PREDICTIONS_FILE).close()  # refused while another process holds it
     remove(folder / name for name in (PREDICTIONS_FILE, RUN_FILE))
 
 
 def find_runs(study: Path) -> list[Path]:
-    """Folders of the runs in a study: itself, or those inside it, by name.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Folders of the runs in a study: itself, or those inside it, by name. Raises InputError: there is none."""
     if (study / RUN_FILE).is_file():
         return [study]
     found = sorted(path.parent for path in study.glob(f"*/{RUN_FILE}")) if study.is_dir() else []
@@ -88,11 +81,7 @@ def find_runs(study: Path) -> list[Path]:
 
 
 def read_info(folder: Path) -> RunInfo:
-    """What a run says of itself.
-
-    Raises:
-        FormatError: run.json is damaged.
-    """
+    """What a run says of itself. Raises FormatError: run.json is damaged."""
     path = folder / RUN_FILE
     try:
         return RunInfo(**json.loads(path.read_text(encoding="utf-8")))
@@ -101,11 +90,8 @@ def read_info(folder: Path) -> RunInfo:
 
 
 def read_predictions(folder: Path) -> list[Prediction]:
-    """The predictions of a run; of a pair that was written twice, the first.
-
-    Raises:
-        FormatError: a line is damaged; names it.
-    """
+    """The predictions of a run; of a pair that was written twice, the first. Raises FormatError: a line is
+    damaged; names it."""
     predictions: dict[str, Prediction] = {}
     path = folder / PREDICTIONS_FILE
     for number, record in enumerate(read_journal(path), start=1):
@@ -146,11 +132,7 @@ def encode(prediction: Prediction) -> dict[str, Any]:
 
 
 def decode(record: dict[str, Any]) -> Prediction:
-    """Inverse of `encode`.
-
-    Raises:
-        KeyError, TypeError, ValueError: the record is no prediction.
-    """
+    """Inverse of `encode`. Raises KeyError, TypeError, ValueError: the record is no prediction."""
     stored = record["labels"]
     labels = None
     if stored is not None:

@@ -114,11 +114,8 @@ class Method(Protocol):
         ...
 
     def __call__(self, given: MethodInput) -> Answer:
-        """Register one pair.
-
-        Raises:
-            GeoMoE3DError: the pair cannot be registered; counted as a pair without an answer.
-        """
+        """Register one pair. Raises GeoMoE3DError: the pair cannot be registered; counted as a pair without
+        an answer."""
         ...
 
 

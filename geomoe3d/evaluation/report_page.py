@@ -289,11 +289,8 @@ def make_card(
 
 
 def _clouds(pair: EvaluationPair, given: Mapping[str, FloatArray | None], max_points: int) -> dict[str, Any]:
-    """Both clouds, each about its own middle, and the motions between them so centred.
-
-    Raises:
-        GeoMoE3DError: a cloud cannot be read or holds no finite point.
-    """
+    """Both clouds, each about its own middle, and the motions between them so centred. Raises GeoMoE3DError:
+    a cloud cannot be read or holds no finite point."""
     rng = np.random.default_rng(0)
     points, centers = [], []
     for path in (pair.source, pair.target):

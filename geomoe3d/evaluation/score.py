@@ -78,12 +78,8 @@ def compare_all(runs: list[ScoredRun]) -> list[Comparison]:
 
 
 def write_report(path: str | Path, runs: list[ScoredRun], *, force: bool = False) -> None:
-    """Write a report; the suffix decides: .html to look at, .md to quote, .json to compute with.
-
-    Raises:
-        InputError: another suffix.
-        OutputError: the file exists and ``force`` is False, or cannot be written.
-    """
+    """Write a report; the suffix decides: .html to look at, .md to quote, .json to compute with. Raises
+    InputError: another suffix; OutputError: the file exists and ``force`` is False, or cannot be written."""
     path = Path(path)
     scores, comparisons = [run.score for run in runs], compare_all(runs)
     if path.suffix == ".html":

@@ -34,11 +34,7 @@ TRACKS = ("1k", "all", "clouds")
 
 
 def needs(track: str) -> str:
-    """Which kind of input the track gives: ``clouds`` or ``correspondences``.
-
-    Raises:
-        InputError: no such track.
-    """
+    """Which kind of input the track gives: ``clouds`` or ``correspondences``. Raises InputError: no such track."""
     if track not in TRACKS:
         raise InputError(f"there is no track '{track}'; there are: {', '.join(TRACKS)}")
     return "clouds" if track == "clouds" else "correspondences"
@@ -85,11 +81,7 @@ class InputMaker:
         }
 
     def __call__(self, pair: EvaluationPair) -> MethodInput:
-        """The input of one pair.
-
-        Raises:
-            InputError: a cloud or the correspondences cannot be read.
-        """
+        """The input of one pair. Raises InputError: a cloud or the correspondences cannot be read."""
         if self.track == "clouds":
             source, target = self._points(pair.source), self._points(pair.target)
             return MethodInput(pair.id, source=source, target=target, seed=self.seed)

@@ -148,9 +148,6 @@ class _Network:
 
 
 def load_tensors(path: Path) -> dict[str, Float32Array]:
-    """The tensors of a weight file by name, float32.
-
-    Raises:
-        CheckpointError: no such file, or it is none of this network's.
-    """
+    """The tensors of a weight file by name, float32. Raises CheckpointError: no such file, or it is none of
+    this network's."""
     return read_tensors(path, "the learned descriptor", "head.2.weight", (LEARNED, None))

@@ -73,12 +73,8 @@ class GeoMoEFilter(OutlierFilter):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path) -> Self:
-        """Load a .safetensors file with its card.
-
-        Raises:
-            CheckpointError: see `geomoe3d.networks.pretrained.load_pretrained`.
-            DependencyError: PyTorch is not installed.
-        """
+        """Load a .safetensors file with its card. Raises CheckpointError: see
+        `geomoe3d.networks.pretrained.load_pretrained`; DependencyError: PyTorch is not installed."""
         try:
             from geomoe3d.networks.pretrained import load_pretrained
         except ImportError as error:

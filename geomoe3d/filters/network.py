@@ -42,21 +42,14 @@ class NetworkFilter(OutlierFilter):
 
     @classmethod
     def from_config(cls, config: FilterConfig) -> Self:
-        """With the weights that the configuration names.
-
-        Raises:
-            CheckpointError: none given, not found, broken, or of another network.
-            DependencyError: PyTorch is not installed.
-        """
+        """With the weights that the configuration names. Raises CheckpointError: none given, not found,
+        broken, or of another network; DependencyError: PyTorch is not installed."""
         return cls.from_pretrained(config.name, config.weights)
 
     @classmethod
     def from_pretrained(cls, kind: str, weights: str | Path | None) -> Self:
-        """A network of this kind from a .safetensors file with its card beside it.
-
-        Raises:
-            CheckpointError, DependencyError: as `from_config`.
-        """
+        """A network of this kind from a .safetensors file with its card beside it. Raises CheckpointError,
+        DependencyError: as `from_config`."""
         if weights is None:
             raise CheckpointError(
                 f"no weights of '{kind}' ship with this version; train it with configs/train/paper/{kind}.yaml "
@@ -83,9 +76,6 @@ class NetworkFilter(OutlierFilter):
         }
 
     def __call__(self, correspondences: Correspondences, *, voxel_size: float, seed: int = 0) -> FilterOutput:
-        """See `OutlierFilter`.
-
-        Raises:
-            InputError: the network was trained with a channel that these correspondences lack.
-        """
+        """See `OutlierFilter`. Raises InputError: the network was trained with a channel that these
+        correspondences lack."""
         return self._weigh(correspondences, voxel_size=voxel_size)

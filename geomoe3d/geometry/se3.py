@@ -108,12 +108,9 @@ def _off_rotation(R: FloatArray) -> float:
 
 
 def check_motion(T: ArrayLike) -> FloatArray:
-    """A user's matrix as a rigid motion (4, 4), its rotation projected onto SO(3).
-
-    Raises:
-        InputError: another shape, non-finite numbers, a last row other than 0 0 0 1, or a linear part that
-            is no rotation: R^T R differs from the identity by more than 0.01, or it mirrors.
-    """
+    """A user's matrix as a rigid motion (4, 4), its rotation projected onto SO(3). Raises InputError: another
+    shape, non-finite numbers, a last row other than 0 0 0 1, or a linear part that is no rotation: R^T R
+    differs from the identity by more than 0.01, or it mirrors."""
     try:
         matrix = np.array(T, dtype=np.float64)
     except (TypeError, ValueError):

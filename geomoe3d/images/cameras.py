@@ -13,11 +13,7 @@ from geomoe3d.types import FloatArray
 
 
 def opencv() -> Any:
-    """OpenCV.
-
-    Raises:
-        DependencyError: it is not installed.
-    """
+    """OpenCV. Raises DependencyError: it is not installed."""
     try:
         import cv2
     except ImportError as error:
@@ -28,11 +24,7 @@ def opencv() -> Any:
 
 
 def simplejpeg() -> Any:
-    """What decodes a JPEG and tells where it is damaged.
-
-    Raises:
-        DependencyError: it is not installed.
-    """
+    """What decodes a JPEG and tells where it is damaged. Raises DependencyError: it is not installed."""
     try:
         import simplejpeg
     except ImportError as error:

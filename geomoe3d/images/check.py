@@ -41,11 +41,8 @@ class TruthCheck:
 
 
 def check_truth(scene: ImageScene, pairs: int = 40, seed: int = 0) -> TruthCheck:
-    """Measure the cameras of a scene on pairs drawn at random.
-
-    Raises:
-        InputError: no two views are turned by 3 to 20 degrees against each other, or they have no matches.
-    """
+    """Measure the cameras of a scene on pairs drawn at random. Raises InputError: no two views are turned by
+    3 to 20 degrees against each other, or they have no matches."""
     chosen = choose_pairs(scene, (3.0, 20.0), pairs, seed)
     seen: dict[Path, Keypoints] = {}
     found = []

@@ -100,11 +100,7 @@ def pose_pairs(scene: ImageScene, count: int) -> list[tuple[View, View]]:
 def read_pair_list(file: Path, root: Path | None = None) -> list[tuple[View, View]]:
     """Pairs of a list as published for YFCC100M and ScanNet: a line has two names, two turns of the images
     (unused), two 3 x 3 intrinsics and a 4 x 4 pose of the second camera, row by row. Images lie in ``root``,
-    else beside the list.
-
-    Raises:
-        FormatError: a line has another number of words.
-    """
+    else beside the list. Raises FormatError: a line has another number of words."""
     pairs = []
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
         words = line.split()
@@ -259,11 +255,8 @@ def outcomes_of(
 def summarise(
     outcomes: Sequence[Outcome], limits: tuple[float, ...], seed: int = 0
 ) -> dict[str, dict[str, Measure]]:
-    """Measures of every method in %, and the difference of their areas to those of `BASELINE` on the same pairs.
-
-    Raises:
-        InputError: nothing to summarise, or methods that were not all given the same pairs.
-    """
+    """Measures of every method in %, and the difference of their areas to those of `BASELINE` on the same
+    pairs. Raises InputError: nothing to summarise, or methods that were not all given the same pairs."""
     by_method: dict[str, list[Outcome]] = {}
     for one in outcomes:
         by_method.setdefault(one.method, []).append(one)

@@ -167,11 +167,8 @@ def match(first: Keypoints, second: Keypoints) -> Matches:
 
 def checked(pixels: object, weights: object, threshold: Any, seed: Any = 0) -> tuple[FloatArray, FloatArray]:
     """Matches (N, 4) and their weights (N,), 0 for rows that are not finite and 1 where none are given.
-
-    Raises:
-        InputError: shapes do not fit, values that are no real numbers or no pixels, a threshold that is not positive,
-            or a seed that OpenCV cannot take.
-    """
+    Raises InputError: shapes do not fit, values that are no real numbers or no pixels, a threshold that is
+    not positive, or a seed that OpenCV cannot take."""
     points = _numbers("matches", pixels)
     shape = points.shape
     w = np.ones(shape[:1]) if weights is None else np.nan_to_num(_numbers("weights", weights))

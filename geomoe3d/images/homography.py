@@ -44,10 +44,7 @@ def find_homography(
     seed: int = 0,
 ) -> HomographyResult:
     """The homography that matches (N, 4) = [u0, v0, u1, v1] agree on; arguments as of `geomoe3d.images.pose`.
-
-    Raises:
-        InputError: shapes do not fit, a threshold that is not positive, or an unknown estimator.
-    """
+    Raises InputError: shapes do not fit, a threshold that is not positive, or an unknown estimator."""
     pixels, w = checked(pixels, weights, threshold, seed)
     usable = np.isfinite(pixels).all(axis=1)
     kept = np.flatnonzero(w > 0)

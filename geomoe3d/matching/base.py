@@ -36,11 +36,7 @@ class Matcher(Part):
 
 
 def features_of(source: PreparedCloud, target: PreparedCloud) -> tuple[Float32Array, Float32Array]:
-    """The features of both clouds.
-
-    Raises:
-        InputError: a cloud without features.
-    """
+    """The features of both clouds. Raises InputError: a cloud without features."""
     if source.features is None or target.features is None:
         raise InputError(
             "match needs clouds with features; call with_features(cloud, descriptor) on both first"

@@ -44,11 +44,8 @@ class DualSoftmaxMatcher(Matcher):
         seed: int = 0,
         with_ratio: bool = False,
     ) -> Correspondences:
-        """See `Matcher`; ``seed`` decides nothing, and there is no ratio.
-
-        Raises:
-            InputError: a cloud without features.
-        """
+        """See `Matcher`; ``seed`` decides nothing, and there is no ratio. Raises InputError: a cloud without
+        features."""
         own, others = features_of(source, target)
         column, log_score = best_by_dual_softmax(own, others, self.temperature)
         rows = np.sort(np.argsort(-log_score, kind="stable")[:limit])

@@ -37,11 +37,7 @@ class Tensors:
         return part
 
     def array(self, name: str, *shape: int) -> FloatArray:
-        """One tensor.
-
-        Raises:
-            CheckpointError: missing or of another shape.
-        """
+        """One tensor. Raises CheckpointError: missing or of another shape."""
         name = self._prefix + name
         found = self._tensors.get(name)
         if found is None or found.shape != shape:

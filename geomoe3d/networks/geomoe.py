@@ -143,11 +143,8 @@ def together_under_motion(channels: Tensor | None) -> Tensor:
 
 
 def find_neighbors(coordinates: Tensor, config: NetworkConfig, mask: Tensor | None = None) -> Tensor:
-    """Neighbours (B, N, K) by distance in the configured space; padding neighbours only itself.
-
-    Raises:
-        ValueError: the configuration asks for neighbours by compatibility, which coordinates do not give.
-    """
+    """Neighbours (B, N, K) by distance in the configured space; padding neighbours only itself. Raises
+    ValueError: the configuration asks for neighbours by compatibility, which coordinates do not give."""
     if config.knn_space == "compatibility":
         raise ValueError("neighbours by compatibility come with the input (geomoe3d.networks.inputs)")
     values = coordinates

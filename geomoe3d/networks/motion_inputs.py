@@ -59,12 +59,8 @@ class MotionInputs:
 def centred_voxels(
     correspondences: NDArray[Any], voxel_size: float, config: NetworkConfig
 ) -> tuple[FloatArray, Float32Array]:
-    """The points (N, 2d) in double precision, and centred in voxels.
-
-    Raises:
-        InputError: wrong shape, fewer than 3 rows, or a voxel size that is not positive.
-        NonFiniteError: a coordinate is NaN or infinite.
-    """
+    """The points (N, 2d) in double precision, and centred in voxels. Raises InputError: wrong shape, fewer
+    than 3 rows, or a voxel size that is not positive; NonFiniteError: a coordinate is NaN or infinite."""
     points = np.asarray(correspondences, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != config.correspondence_dim:
         raise InputError(

@@ -62,11 +62,8 @@ class MotionJudge:
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path) -> MotionJudge:
-        """Load a .safetensors file with its card, or weights that ship with the package.
-
-        Raises:
-            CheckpointError: see `geomoe3d.networks.weight_files.read_weights` and `FoldedGeoMoE`.
-        """
+        """Load a .safetensors file with its card, or weights that ship with the package. Raises
+        CheckpointError: see `geomoe3d.networks.weight_files.read_weights` and `FoldedGeoMoE`."""
         config, tensors, card = read_weights(name_or_path)
         return cls(FoldedGeoMoE(config, tensors), card)
 

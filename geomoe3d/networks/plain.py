@@ -38,11 +38,8 @@ class PlainNetwork:
 
     @torch.no_grad()
     def __call__(self, correspondences: Correspondences, *, voxel_size: float) -> FilterOutput:
-        """Weigh correspondences. With fewer than 3 finite rows all weights are 0.
-
-        Raises:
-            InputError: the network was trained with a channel that these correspondences lack.
-        """
+        """Weigh correspondences. With fewer than 3 finite rows all weights are 0. Raises InputError: the
+        network was trained with a channel that these correspondences lack."""
         weights = np.zeros(len(correspondences))
         logits = np.full(len(correspondences), -np.inf)
         seen, part = finite_part(correspondences)

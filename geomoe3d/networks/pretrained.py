@@ -66,11 +66,8 @@ def save_pretrained(
 
 
 def load_pretrained(name_or_path: str | Path) -> tuple[GeoMoE, WeightCard]:
-    """A GeoMoE in evaluation mode, and its card; see `load_network`.
-
-    Raises:
-        CheckpointError: as there, and for weights of another architecture.
-    """
+    """A GeoMoE in evaluation mode, and its card; see `load_network`. Raises CheckpointError: as there, and
+    for weights of another architecture."""
     model, card = load_network(name_or_path)
     if not isinstance(model, GeoMoE):
         kind = model.config.kind

@@ -53,11 +53,8 @@ class WeightCard:
 
 
 def find_weights(name_or_path: str | Path) -> Path:
-    """The file that a name or path means.
-
-    Raises:
-        CheckpointError: there is none; the message lists what ships with the package.
-    """
+    """The file that a name or path means. Raises CheckpointError: there is none; the message lists what ships
+    with the package."""
     path = Path(name_or_path)
     if path.is_file():
         return path
@@ -75,10 +72,7 @@ def packaged_names() -> list[str]:
 
 def judges_transforms(name_or_path: str | Path) -> bool:
     """Whether weights are of a network that scores transforms, by their card; False where there is no card.
-
-    Raises:
-        CheckpointError: no such weights.
-    """
+    Raises CheckpointError: no such weights."""
     card = find_weights(name_or_path).with_suffix(".json")
     try:
         architecture = json.loads(card.read_text(encoding="utf-8"))["architecture"]
@@ -88,11 +82,8 @@ def judges_transforms(name_or_path: str | Path) -> bool:
 
 
 def check_weights(name_or_path: str | Path) -> Path:
-    """The file that a name or path means, whose content is what its card says; needs no torch.
-
-    Raises:
-        CheckpointError: not found, without a proper card, or damaged.
-    """
+    """The file that a name or path means, whose content is what its card says; needs no torch. Raises
+    CheckpointError: not found, without a proper card, or damaged."""
     path = find_weights(name_or_path)
     expected = read_card(path).sha256
     if (digest := file_hash(path, CheckpointError)) != expected:
@@ -126,11 +117,7 @@ def read_weights(name_or_path: str | Path) -> tuple[NetworkConfig, dict[str, NDA
 
 
 def read_card(path: str | Path) -> WeightCard:
-    """The card beside a weight file.
-
-    Raises:
-        CheckpointError: missing, unreadable, or of another format or version.
-    """
+    """The card beside a weight file. Raises CheckpointError: missing, unreadable, or of another format or version."""
     place = card_path(Path(path))
     try:
         values = json.loads(place.read_text(encoding="utf-8"))

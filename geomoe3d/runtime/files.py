@@ -90,11 +90,8 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], None]
 
 
 def write_text(path: str | os.PathLike[str], text: str, *, force: bool) -> None:
-    """Create ``path`` with ``text`` in UTF-8; line ends stay as they are in it, on every system.
-
-    Raises:
-        OutputError: as `write_atomically`.
-    """
+    """Create ``path`` with ``text`` in UTF-8; line ends stay as they are in it, on every system. Raises
+    OutputError: as `write_atomically`."""
 
     def write(temporary: Path) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -103,11 +100,7 @@ def write_text(path: str | os.PathLike[str], text: str, *, force: bool) -> None:
 
 
 def file_hash(path: Path, unreadable: type[GeoMoE3DError] = InputError) -> str:
-    """sha256 of a file, hexadecimal, read in pieces.
-
-    Raises:
-        unreadable: it cannot be read.
-    """
+    """sha256 of a file, hexadecimal, read in pieces. Raises unreadable: it cannot be read."""
     digest = hashlib.sha256()
     try:
         with path.open("rb") as stream:
@@ -146,21 +139,13 @@ def refusals(message: str) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder if it is not there, and those that it lies in.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
+    """Make a folder if it is not there, and those that it lies in. Raises OutputError: it cannot be made."""
     with refusals(f"cannot make the folder '{folder}'"):
         folder.mkdir(parents=True, exist_ok=True)
 
 
 def remove(paths: Iterable[Path]) -> None:
-    """Delete files, if they are there.
-
-    Raises:
-        OutputError: one cannot be removed.
-    """
+    """Delete files, if they are there. Raises OutputError: one cannot be removed."""
     for path in paths:
         with refusals(f"cannot remove '{path}'"):
             path.unlink(missing_ok=True)

@@ -70,12 +70,9 @@ class Journal:
         self._synced = time.monotonic()
 
     def append(self, record: dict[str, Any]) -> None:
-        """Add one record. It survives a kill from now on, and a power cut within a second.
-
-        Raises:
-            OutputError: the disk refuses.
-            ValueError: the record holds a NaN or infinite number, which JSON does not have.
-        """
+        """Add one record. It survives a kill from now on, and a power cut within a second. Raises
+        OutputError: the disk refuses; ValueError: the record holds a NaN or infinite number, which JSON does
+        not have."""
         line = json.dumps(record, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         with self._writing():
             self._stream.write(line)

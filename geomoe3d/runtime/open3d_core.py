@@ -22,10 +22,7 @@ _lock = threading.Lock()
 
 def open3d_core() -> Any:
     """Open3D, or what of it registration needs: ``geometry``, ``utility``, ``pipelines``, ``t`` and ``core``.
-
-    Raises:
-        ImportError: Open3D is not installed.
-    """
+    Raises ImportError: Open3D is not installed."""
     with _lock:
         if "open3d" not in sys.modules and (_NAME in sys.modules or _load()):
             return sys.modules[_NAME]

@@ -61,11 +61,8 @@ def library_versions(modules: frozenset[str]) -> dict[str, str]:
 
 
 def source_file(module: str) -> Path:
-    """The file that a module was or would be loaded from.
-
-    Raises:
-        ModuleNotFoundError: there is none, as for a module without source.
-    """
+    """The file that a module was or would be loaded from. Raises ModuleNotFoundError: there is none, as for a
+    module without source."""
     loaded = sys.modules.get(module)
     place = getattr(loaded, "__file__", None)
     if place is None:

@@ -62,12 +62,9 @@ scorer: Registry[Scorer] = Registry("scorer", "geomoe3d.scoring", lambda: Scorer
 
 
 def make_scorers(config: ScoringConfig) -> dict[str, Scorer]:
-    """The scorers that a resolved configuration names, in its order.
-
-    Raises:
-        ConfigError: an unknown name, or settings that a scorer does not take.
-        CheckpointError, DependencyError: trained weights or a library are missing.
-    """
+    """The scorers that a resolved configuration names, in its order. Raises ConfigError: an unknown name, or
+    settings that a scorer does not take; CheckpointError, DependencyError: trained weights or a library are
+    missing."""
     for name in config.options:
         if name == "network":
             raise ConfigError("scoring.options.network: its weights are given as scoring.weights")

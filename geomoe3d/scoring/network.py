@@ -90,11 +90,7 @@ class NetworkScorer(Scorer):
         return MotionJudge.from_pretrained(self._path)
 
     def warm_up(self) -> None:
-        """Load the network.
-
-        Raises:
-            CheckpointError: the weights do not fit.
-        """
+        """Load the network. Raises CheckpointError: the weights do not fit."""
         self._judge  # noqa: B018
 
     def identity(self) -> dict[str, Any]:

@@ -111,9 +111,6 @@ def _linear(tensors: dict[str, Float32Array], name: str, x: Float32Array) -> Flo
 
 
 def load_tensors(path: Path) -> dict[str, Float32Array]:
-    """The tensors of a weight file by name, float32.
-
-    Raises:
-        CheckpointError: no such file, or it is none of this network's.
-    """
+    """The tensors of a weight file by name, float32. Raises CheckpointError: no such file, or it is none of
+    this network's."""
     return read_tensors(path, "the surface network", "point.0.weight", (None, NUM_CHANNELS))

@@ -88,11 +88,7 @@ class SurfaceScorer(Scorer):
 
 
 def evidence_of(hypothesis: Hypothesis) -> Evidence:
-    """What the clouds say of a scored hypothesis.
-
-    Raises:
-        KeyError: the clouds were not asked.
-    """
+    """What the clouds say of a scored hypothesis. Raises KeyError: the clouds were not asked."""
     found = hypothesis.scores[SURFACES]
     assert isinstance(found, Evidence)
     return found

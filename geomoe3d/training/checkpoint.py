@@ -43,11 +43,8 @@ def save_checkpoint(path: Path, state: dict[str, Any], config: TrainConfig, data
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The state of ``path``, tensors on the CPU.
-
-    Raises:
-        CheckpointError: unreadable, truncated, or not one of ours.
-    """
+    """The state of ``path``, tensors on the CPU. Raises CheckpointError: unreadable, truncated, or not one of
+    ours."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -60,11 +57,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: Path) -> None:
-    """Refuse to go on with another configuration or other data than the run began with.
-
-    Raises:
-        CheckpointError: names what differs.
-    """
+    """Refuse to go on with another configuration or other data than the run began with. Raises
+    CheckpointError: names what differs."""
     try:
         before = TrainConfig.model_validate_json(state["config"])
     except ValidationError as error:

@@ -51,11 +51,8 @@ def leave() -> None:
 
 
 def choose_device(name: str, process: Process) -> torch.device:
-    """``auto``: this process's GPU if there is one, else the CPU; ``cuda`` alone: this process's GPU.
-
-    Raises:
-        ConfigError: no device of this name, or none on this machine.
-    """
+    """``auto``: this process's GPU if there is one, else the CPU; ``cuda`` alone: this process's GPU. Raises
+    ConfigError: no device of this name, or none on this machine."""
     there = torch.cuda.is_available()
     if name == "auto":
         name = "cuda" if there else "cpu"

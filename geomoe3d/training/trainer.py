@@ -106,11 +106,8 @@ class TrainingRun:
         return self.folder / "best.pt"
 
     def train(self, reporter: Reporter, until: int | None = None) -> Summary:
-        """Train to the end of the schedule, to step ``until``, or until ``stop`` is set.
-
-        Raises:
-            GeoMoE3DError: too many steps in a row had no finite gradient.
-        """
+        """Train to the end of the schedule, to step ``until``, or until ``stop`` is set. Raises
+        GeoMoE3DError: too many steps in a row had no finite gradient."""
         config, progress = self.config, self.progress
         last_step = config.steps if until is None else min(until, config.steps)
         wrapped: torch.nn.Module = self.model

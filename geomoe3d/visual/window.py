@@ -172,11 +172,8 @@ class WindowContent:
 
 
 def check_display() -> None:
-    """Say in words that there is no display, where Open3D would hang on an invisible window.
-
-    Raises:
-        OutputError: on Linux, neither X11 nor Wayland answers.
-    """
+    """Say in words that there is no display, where Open3D would hang on an invisible window. Raises
+    OutputError: on Linux, neither X11 nor Wayland answers."""
     if not sys.platform.startswith("linux"):
         return
     instead = "write a picture (.png) or a page (.html) instead"

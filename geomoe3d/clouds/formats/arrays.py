@@ -28,11 +28,8 @@ _TOO_LARGE = "describes more numbers than memory holds: its header is wrong, or 
 
 @reader(".npy")
 def read_npy(path: Path) -> RawCloud:
-    """(N, C) numbers by the rule of `split_columns`, or anything else that `table_cloud` takes.
-
-    Raises:
-        FormatError: no NPY file, truncated, pickled, or of another shape or type.
-    """
+    """(N, C) numbers by the rule of `split_columns`, or anything else that `table_cloud` takes. Raises
+    FormatError: no NPY file, truncated, pickled, or of another shape or type."""
     try:
         with path.open("rb") as handle:
             array = np.load(handle, allow_pickle=False)

@@ -27,11 +27,7 @@ _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 
 
 def require_pye57() -> Any:
-    """The module pye57.
-
-    Raises:
-        DependencyError: it is not installed.
-    """
+    """The module pye57. Raises DependencyError: it is not installed."""
     try:
         import pye57
     except ImportError:
@@ -76,10 +72,7 @@ def read_e57(path: Path) -> RawCloud:
 
 def read_scans(path: Path) -> Iterator[RawCloud]:
     """The scans of a file that hold points, one by one, each moved by its pose, ``sensor`` being its place.
-
-    Raises:
-        FormatError, DependencyError: as `read_e57`, in the course of reading.
-    """
+    Raises FormatError, DependencyError: as `read_e57`, in the course of reading."""
     pye57 = require_pye57()
     _check_size(path)
     try:

@@ -35,11 +35,8 @@ _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"
 @reader(".glb", ".gltf")
 def read_gltf(path: Path) -> RawCloud:
     """All triangles of the scene in its own frame, or, where it has none, its points; with vertex colours.
-
-    Raises:
-        FormatError: no glTF 2.0, truncated, damaged, or a required extension is not understood (named).
-        EmptyCloudError: no geometry.
-    """
+    Raises FormatError: no glTF 2.0, truncated, damaged, or a required extension is not understood (named);
+    EmptyCloudError: no geometry."""
     try:
         return _read(path)
     except (FormatError, EmptyCloudError, OSError, MemoryError):
@@ -245,11 +242,8 @@ def _triangles(rows: IntArray, mode: int) -> IntArray:
 
 
 def read_chunks(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The JSON of a GLB or GLTF and the binary chunk (empty where there is none).
-
-    Raises:
-        FormatError: no glTF 2.0, or shorter than it says.
-    """
+    """The JSON of a GLB or GLTF and the binary chunk (empty where there is none). Raises FormatError: no glTF
+    2.0, or shorter than it says."""
     data = path.read_bytes()
     binary = b""
     text = data

@@ -21,11 +21,7 @@ from geomoe3d.types import FloatArray
 
 
 def require_laspy(compressed: bool) -> Any:
-    """The module laspy, able to read and write LAZ if ``compressed``.
-
-    Raises:
-        DependencyError: it is not installed.
-    """
+    """The module laspy, able to read and write LAZ if ``compressed``. Raises DependencyError: it is not installed."""
     try:
         import laspy
     except ImportError:
@@ -61,11 +57,8 @@ def read_las(path: Path) -> RawCloud:
 
 
 def read_pieces(path: Path, size: int) -> Iterator[FloatArray]:
-    """The coordinates (n, 3) of a file as `read_las` gives them, at most ``size`` points at a time.
-
-    Raises:
-        FormatError, DependencyError: as `read_las`, in the course of reading.
-    """
+    """The coordinates (n, 3) of a file as `read_las` gives them, at most ``size`` points at a time. Raises
+    FormatError, DependencyError: as `read_las`, in the course of reading."""
     with _opened(path) as reader:
         count = 0
         for some in reader.chunk_iterator(size):

@@ -30,11 +30,8 @@ from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 
 def load_scene(path: Path) -> Any:
-    """What trimesh makes of a mesh file: a mesh, a cloud or a scene.
-
-    Raises:
-        FormatError: trimesh refuses the file, or a stated count or length is not borne out.
-    """
+    """What trimesh makes of a mesh file: a mesh, a cloud or a scene. Raises FormatError: trimesh refuses the
+    file, or a stated count or length is not borne out."""
     suffix = path.suffix.lower()
     size = _stl_size(path) if suffix == ".stl" else None
     if suffix == ".off":
@@ -77,12 +74,7 @@ _OFF_LETTERS = {"ST": "texture coordinates", "C": "colors", "N": "normals"}
 
 @reader(".obj", ".stl", ".off")
 def read_mesh(path: Path) -> RawCloud:
-    """All geometry of a mesh file in one frame.
-
-    Raises:
-        FormatError: as `load_scene`.
-        EmptyCloudError: no geometry.
-    """
+    """All geometry of a mesh file in one frame. Raises FormatError: as `load_scene`; EmptyCloudError: no geometry."""
     scene = load_scene(path)
     with _as_format_errors(path):
         mesh = flatten(scene, f"'{path}'")
@@ -240,11 +232,8 @@ def without_vertices(mesh: RawCloud, kept: BoolArray) -> RawCloud:
 
 
 def sample_surface(mesh: RawCloud, num_points: int, seed: int, what: str) -> FloatArray:
-    """Points (num_points, 3) spread evenly over the area of a finite mesh, the same for the same seed.
-
-    Raises:
-        InputError: the surface has no area.
-    """
+    """Points (num_points, 3) spread evenly over the area of a finite mesh, the same for the same seed. Raises
+    InputError: the surface has no area."""
     import trimesh
 
     origin = choose_origin(mesh.points)  # areas of small triangles far from zero would drown in rounding

@@ -18,12 +18,8 @@ from geomoe3d.types import FloatArray
 
 
 def points_array(data: Any, what: str = "the points") -> FloatArray:
-    """(N, 3) float64, a copy, of anything numpy understands.
-
-    Raises:
-        InputError: not a real-number array of shape (N, 3); the message says what was found.
-        EmptyCloudError: no rows.
-    """
+    """(N, 3) float64, a copy, of anything numpy understands. Raises InputError: not a real-number array of
+    shape (N, 3); the message says what was found; EmptyCloudError: no rows."""
     return _array_cloud(data, what).points
 
 
@@ -45,12 +41,8 @@ def _array_cloud(data: Any, what: str = "the points") -> RawCloud:
 
 
 def raw_from_object(data: Any) -> RawCloud:
-    """The content of an object in memory, copied.
-
-    Raises:
-        InputError: nothing that holds points.
-        EmptyCloudError: no points.
-    """
+    """The content of an object in memory, copied. Raises InputError: nothing that holds points;
+    EmptyCloudError: no points."""
     library = library_of(data)
     if library == "torch":
         return _array_cloud(_from_torch(data))

@@ -58,11 +58,8 @@ class _Header:
 
 @reader(".pcd")
 def read_pcd(path: Path) -> RawCloud:
-    """Points with normals (normal_x ...), colours (packed rgb, or r, g, b) and fields.
-
-    Raises:
-        FormatError: no PCD, a header that does not parse, or a count that the content does not bear out.
-    """
+    """Points with normals (normal_x ...), colours (packed rgb, or r, g, b) and fields. Raises FormatError: no
+    PCD, a header that does not parse, or a count that the content does not bear out."""
     with path.open("rb") as handle:
         header = _read_header(handle, path)
         single = [k for k, count in enumerate(header.counts) if count == 1 and header.names[k] != "_"]

@@ -60,10 +60,8 @@ class _Element:
 @reader(".ply")
 def read_ply(path: Path) -> RawCloud:
     """Vertices with all their numbers, and the faces (polygons cut into triangle fans) if there are any.
-
-    Raises:
-        FormatError: no PLY, an unknown header line, or counts that the file's content does not bear out.
-    """
+    Raises FormatError: no PLY, an unknown header line, or counts that the file's content does not bear
+    out."""
     with path.open("rb") as handle:
         order, elements, num_lines = _read_header(handle, path)
         names = [element.name for element in elements]
@@ -194,11 +192,8 @@ class _RaggedRows(_Rows):
 def _read_rows(
     body: _Bytes, place: int, order: str, element: _Element, path: Path, last: bool
 ) -> tuple[_Rows, int]:
-    """The rows of an element that begin at byte ``place``, and the byte behind them.
-
-    Raises:
-        FormatError: the body holds fewer rows, or, behind the last element without lists, more.
-    """
+    """The rows of an element that begin at byte ``place``, and the byte behind them. Raises FormatError: the
+    body holds fewer rows, or, behind the last element without lists, more."""
     what = f"rows of '{element.name}'"
     has_lists = any(length is not None for _, _, length in element.properties)
     if not (element.count and element.properties):

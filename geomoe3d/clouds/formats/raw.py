@@ -250,11 +250,7 @@ def chunks(num_rows: int, row_bytes: int) -> Iterator[slice]:
 
 
 def header_count(text: str, path: Path, what: str) -> int:
-    """A count from a header.
-
-    Raises:
-        FormatError: the text is no whole number, negative or beyond any file.
-    """
+    """A count from a header. Raises FormatError: the text is no whole number, negative or beyond any file."""
     try:
         count = int(text)
     except ValueError:

@@ -115,10 +115,7 @@ def parse_table(
     path: Path, lines: DataLines, delimiter: str | None, width: int, columns: list[int] | None = None
 ) -> FloatArray:
     """Numbers of the remaining lines (rows, ``width``), or some of their columns; no lines give no rows.
-
-    Raises:
-        FormatError: a line is not ``width`` numbers; the message names it.
-    """
+    Raises FormatError: a line is not ``width`` numbers; the message names it."""
     first = next(lines, None)
     if first is None:
         return np.empty((0, width if columns is None else len(columns)))

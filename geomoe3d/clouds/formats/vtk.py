@@ -81,10 +81,7 @@ class _Body:
 @reader(".vtk")
 def read_vtk(path: Path) -> RawCloud:
     """POINTS of a legacy file, with normals, colours, vectors and scalars of POINT_DATA, and its triangles.
-
-    Raises:
-        FormatError: no legacy VTK file, no points, or fewer values than it says.
-    """
+    Raises FormatError: no legacy VTK file, no points, or fewer values than it says."""
     with path.open("rb") as handle:
         if not handle.readline(256).startswith(b"# vtk DataFile"):
             raise FormatError(
@@ -164,11 +161,8 @@ def _read_cells(body: _Body, words: list[str]) -> _Lists:
 def _faces(
     path: Path, cells: dict[str, _Lists], kinds: IntArray, num_points: int
 ) -> tuple[IntArray | None, list[str]]:
-    """Triangles (M, 3) of all flat cells, or None, and names of the other cells.
-
-    Raises:
-        FormatError: a cell names a point that there is not, or the cells are more or fewer than their types.
-    """
+    """Triangles (M, 3) of all flat cells, or None, and names of the other cells. Raises FormatError: a cell
+    names a point that there is not, or the cells are more or fewer than their types."""
     found: list[IntArray] = []
     others: list[str] = []
     for key, (begins, points) in cells.items():

@@ -129,11 +129,8 @@ class ModelLibrary:
 
 
 def open_library(folders: list[str | Path]) -> ModelLibrary:
-    """List the models of folders; nothing is loaded yet.
-
-    Raises:
-        InputError: a folder is missing, or none of them holds a model whose kind is known.
-    """
+    """List the models of folders; nothing is loaded yet. Raises InputError: a folder is missing, or none of
+    them holds a model whose kind is known."""
     library = ModelLibrary([Path(folder) for folder in folders])
     for folder in library.folders:
         if not folder.is_dir():

@@ -65,12 +65,8 @@ def generate_scene(
 
 
 def load_mesh_scene(path: str | Path) -> Scene:
-    """A mesh as it is, in metres with z up.
-
-    Raises:
-        InputError: no such file, or it holds no triangles.
-        FormatError: it cannot be read.
-    """
+    """A mesh as it is, in metres with z up. Raises InputError: no such file, or it holds no triangles;
+    FormatError: it cannot be read."""
     import trimesh
 
     path = Path(path)

@@ -14,6 +14,7 @@ import numpy as np
 
 from geomoe3d.clouds.inputs import NOT_KEPT, Inputs
 from geomoe3d.errors import InputError
+from geomoe3d.runtime.plain import plain
 from geomoe3d.types import Accuracy, Alternative, BoolArray, CloudReport, FloatArray
 
 if TYPE_CHECKING:
@@ -336,7 +337,7 @@ class RegistrationResult:
 
     def to_json(self, indent: int | None = 2) -> str:
         """JSON text; floats keep every bit, missing numbers are null."""
-        return json.dumps(_plain(asdict(self)), indent=indent, allow_nan=False)
+        return json.dumps(plain(asdict(self)), indent=indent, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> RegistrationResult:
@@ -366,21 +367,6 @@ class RegistrationResult:
             return cls(**data)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"this text is not a registration result: {error!r}") from None
-
-
-def _plain(value: Any) -> Any:
-    """Arrays to lists and non-finite numbers to None, since JSON has neither."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:

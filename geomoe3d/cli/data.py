@@ -230,7 +230,7 @@ def synthesize(
     from pathlib import Path
 
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
-    from geomoe3d.config import build_config, read_yaml, set_keys
+    from geomoe3d.config import build_config, read_yaml, set_keys, yaml_text
     from geomoe3d.data.contact import draw_contact_sheet
     from geomoe3d.data.report import report_text, write_report
     from geomoe3d.data.settings import SynthesisSettings
@@ -241,9 +241,7 @@ def synthesize(
     tree = set_keys(read_yaml(config) if config else {}, list(assignments))
     settings = build_config(SynthesisSettings, tree, config or "settings")
     if show:
-        import yaml
-
-        click.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), nl=False)
+        click.echo(yaml_text(settings), nl=False)
         return
     with stdout_to_stderr(), progress_bar("scenes") as advance:
         report = make(out, given.pop("scenes"), settings=settings, progress=advance, **given)

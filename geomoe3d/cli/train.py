@@ -46,14 +46,13 @@ def command(
     folder, a run continues from its last checkpoint, exactly. Under torchrun it uses every process.
     The folder gets logs (CSV, TensorBoard), checkpoints, weights.safetensors with its card, curves.png.
     """
+    from geomoe3d.config import yaml_text
     from geomoe3d.training.config import load_train_config
 
     refuse_bare_settings(bare)
     settings = load_train_config(config, list(assignments))
     if show:
-        import yaml
-
-        click.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), nl=False)
+        click.echo(yaml_text(settings), nl=False)
     elif overfit:
         context.exit(_overfit(settings, quiet))
     else:

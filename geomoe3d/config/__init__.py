@@ -4,7 +4,7 @@
 """
 
 from geomoe3d.config.expert import ExpertConfig, expert, expert_in_force, expert_of_argument, in_force
-from geomoe3d.config.reading import build_config, known_keys, load_config, read_yaml, set_keys
+from geomoe3d.config.reading import build_config, known_keys, load_config, read_yaml, set_keys, yaml_text
 from geomoe3d.config.section import Section
 from geomoe3d.config.sections import (
     DecisionConfig,
@@ -43,4 +43,5 @@ __all__ = [
     "load_config",
     "read_yaml",
     "set_keys",
+    "yaml_text",
 ]

@@ -116,6 +116,13 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     return tree
 
 
+def yaml_text(section: Section) -> str:
+    """A whole configuration as YAML, without comments; `read_yaml` reads it."""
+    import yaml
+
+    return yaml.safe_dump(section.model_dump(mode="json"), sort_keys=False)
+
+
 def _twice(node: Any, prefix: str = "") -> list[str]:
     """Keys that stand more than once in one mapping of a YAML document, of which YAML silently takes the last."""
     found: list[str] = []

@@ -8,9 +8,7 @@ fragment of 5,000 points; opening costs the header alone.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.errors import FormatError, InputError
+from geomoe3d.runtime.files import file_hash, new_folder
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.types import Float32Array, FloatArray
 
 SHARD_VERSION = 1
 _META = "shard.json"
-_WRITING = ".writing-"
 # name -> (type, trailing shape)
 _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "points": ("<f4", (3,)),
@@ -78,18 +76,12 @@ def write_shard(folder: str | Path, scene: DescribedScene, settings: dict[str, A
     Raises:
         OutputError: the folder exists, or the disk refuses; then nothing is left.
     """
-    folder = Path(folder)
-    if folder.exists():
-        raise OutputError(f"'{folder}' exists; remove it to make it anew")
-    temporary = folder.with_name(_WRITING + folder.name)
-    try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
+    with new_folder(Path(folder), "shard") as temporary:
         hashes = {}
         for name, (kind, _) in _ARRAYS.items():
             path = temporary / f"{name}.npy"
             np.save(path, np.asarray(getattr(scene, name), dtype=kind))
-            hashes[name] = _hash(path)
+            hashes[name] = file_hash(path)
         meta = {
             "version": SHARD_VERSION,
             "name": scene.name,
@@ -99,11 +91,6 @@ def write_shard(folder: str | Path, scene: DescribedScene, settings: dict[str, A
             "sha256": hashes,
         }
         (temporary / _META).write_text(json.dumps(meta, indent=1) + "\n")
-        temporary.rename(folder)
-    except OSError as error:
-        raise OutputError(f"cannot write shard '{folder}': {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def is_shard(folder: Path) -> bool:
@@ -164,7 +151,7 @@ def open_shard(folder: str | Path, *, verify: bool = False) -> DescribedScene:
             raise FormatError(f"shard '{folder}': {name}.npy cannot be read: {error}") from None
         if array.dtype != np.dtype(kind) or array.shape[1:] != trailing:
             raise FormatError(f"shard '{folder}': {name} is {array.dtype} {array.shape}")
-        if verify and _hash(path) != meta.get("sha256", {}).get(name):
+        if verify and file_hash(path) != meta.get("sha256", {}).get(name):
             raise FormatError(f"shard '{folder}': {name}.npy is damaged, its hash differs; make it anew")
         arrays[name] = array
     _check(folder, arrays)
@@ -192,11 +179,3 @@ def shard_folders(folder: str | Path) -> list[Path]:
             f"'{folder}' holds no shard of fragments with features; 'geomoe3d data features' makes them"
         )
     return found
-
-
-def _hash(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()

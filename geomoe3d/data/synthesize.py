@@ -27,7 +27,7 @@ from geomoe3d.data.rooms.scenes import load_mesh_scene
 from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
-from geomoe3d.runtime.files import make_folder, refusals, write_text
+from geomoe3d.runtime.files import make_folder, new_folder, refusals, write_text
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
@@ -185,23 +185,13 @@ def make_scene(job: Job, number: int) -> SceneSummary:
         len(entries),
         sorted(set(library.unreadable[before:])) if library is not None else [],
     )
-    final = Path(job.folder) / scene_name(number)
-    temporary = final.with_name(_WRITING + final.name)
-    try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
+    with new_folder(Path(job.folder) / scene_name(number), "scene") as temporary:
         for k, cloud in enumerate(recorded.clouds):
             save_points(temporary / f"cloud_bin_{k}.ply", cloud)
         np.savetxt(temporary / "poses.txt", np.reshape(recorded.poses, (-1, 16)), fmt="%.17g")
         write_gt_log(temporary / "gt.log", entries, len(recorded.clouds))
         write_gt_overlap(temporary / "gt_overlap.log", overlaps)
-        text = json.dumps(asdict(summary), indent=1) + "\n"
-        (temporary / "scene.json").write_text(text)
-        temporary.rename(final)
-    except OSError as error:
-        raise OutputError(f"cannot write scene '{final}': {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        (temporary / "scene.json").write_text(json.dumps(asdict(summary), indent=1) + "\n")
     return summary
 
 

@@ -106,7 +106,8 @@ def measure_all(
         counted = ~np.isnan(quantity.values)
         count, value = int(counted.sum()), points[row]
         interval = scene_interval = _UNDEFINED
-        if _is_degenerate(quantity, value):
+        share = quantity.statistic in ("mean", "scene_mean") and quantity.unit == "%"
+        if share and value in (0.0, 100.0):
             interval = wilson(value / 100.0, count)
         else:
             if count >= 2:
@@ -199,10 +200,6 @@ def _draws(size: int, width: int, resamples: int, rng: np.random.Generator) -> I
         drawn = rng.integers(size, size=(rows, size)) * rows + np.arange(rows)[:, None]
         counts = np.bincount(drawn.ravel(), minlength=rows * size).reshape(size, rows)
         yield counts.astype(np.float64).T  # one pair after the other in memory, as quantiles want it
-
-
-def _is_degenerate(quantity: Quantity, value: float) -> bool:
-    return quantity.statistic in ("mean", "scene_mean") and quantity.unit == "%" and value in (0.0, 100.0)
 
 
 def _interval(samples: FloatArray, value: float, reflected: bool) -> Interval:

@@ -12,7 +12,7 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -59,10 +59,6 @@ class Peer:
     settings: dict[str, Any]
     local: bool = False
     limits: str = ""
-
-    def with_settings(self, **changes: Any) -> Peer:
-        """The same peer with some settings changed."""
-        return replace(self, settings={**self.settings, **changes})
 
     def identity(self) -> dict[str, Any]:
         """Settings, versions of the libraries, and the hash of the code that defines the peer."""

@@ -31,6 +31,7 @@ from geomoe3d.evaluation.report_words import benchmark_rank, recall_of, run_key,
 from geomoe3d.evaluation.summary import title
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.runtime.files import check_output, write_text
+from geomoe3d.runtime.plain import plain
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import camera_fit, spacing_of, thin
@@ -115,7 +116,7 @@ def render_report(
         "name_of": title,
         "text": report_words,
         "counted": counted,
-        "dumped": lambda identity: json.dumps(report_words.finite(identity), indent=1, sort_keys=True),
+        "dumped": lambda identity: json.dumps(plain(identity), indent=1, sort_keys=True),
     }
     data = {str(card.number): card.clouds for card in cards if card.clouds is not None}
     return render_cloud_page("evaluation", "report", values, data)

@@ -13,7 +13,6 @@ from geomoe3d.evaluation.report_words import (
     COLUMNS,
     LEGEND,
     comparison_rows,
-    finite,
     groups_of,
     interval_text,
     main_row,
@@ -28,6 +27,7 @@ from geomoe3d.evaluation.report_words import (
     with_intervals,
 )
 from geomoe3d.evaluation.summary import title
+from geomoe3d.runtime.plain import plain
 from geomoe3d.runtime.words import counted
 
 # ---- the terminal ---------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ def _run_lines(run: RunScore) -> list[str]:
     lines = [f"## Run {_plain(run.info.label)} ({_plain(run.info.method)})", "", *_warning_lines([run])]
     for name, value in provenance(run):
         lines.append(f"- {name}: {_code(value) if name == 'command' else _plain(value)}")
-    lines += ["", f"identity: {_code(json.dumps(finite(run.info.identity), sort_keys=True))}", ""]
+    lines += ["", f"identity: {_code(json.dumps(plain(run.info.identity), sort_keys=True))}", ""]
     head = ["measure", "key", "value", "unit", "95 % over pairs", "over scenes", "pairs"]
     rows = [
         [
@@ -262,7 +262,7 @@ def to_json(scores: Sequence[RunScore], comparisons: Sequence[Comparison] = ()) 
     """Everything as strict JSON with keys as in the records; numbers that are not finite become null."""
     document = {
         "format": FORMAT,
-        "runs": [finite(asdict(run)) for run in scores],
-        "comparisons": [finite(asdict(comparison)) for comparison in comparisons],
+        "runs": [plain(asdict(run)) for run in scores],
+        "comparisons": [plain(asdict(comparison)) for comparison in comparisons],
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from geomoe3d.data.threedmatch import BENCHMARKS
 from geomoe3d.evaluation.benchmarks import UNRELATED
@@ -186,20 +185,6 @@ def comparison_rows(found: Comparison, names: tuple[str, str]) -> list[tuple[str
         (f"median time of {a} over that of {b}", with_intervals(found.time_ratio)),
         (f"median of time of {a} over time of {b}", with_intervals(found.pair_time_ratio)),
     ]
-
-
-def finite(value: Any) -> Any:
-    """Plain JSON: tuples as lists, numpy's numbers as Python's, what is not finite as None."""
-    if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    if isinstance(value, (bool, int, str)) or value is None:
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    plain: Callable[[], Any] | None = getattr(value, "tolist", None)
-    return finite(plain()) if plain is not None else str(value)
 
 
 def _digits(measure: Measure) -> int:

@@ -53,7 +53,7 @@ class InputMaker:
     def __init__(self, track: str, benchmark: str, root: str | Path | None = None, *, seed: int = 0) -> None:
         needs(track)
         self.track, self.seed = track, seed
-        self._points = lru_cache(8)(_load_points)
+        self._points = lru_cache(8)(lambda path: load_fragment(path).file_points)
         # A benchmark scene has at most 66 fragments, 0.7 MB each.
         self._describe = lru_cache(80)(_describe)
         self._fixed: dict[str, FloatArray] = {}
@@ -110,10 +110,6 @@ class InputMaker:
         if pair.id not in self._fixed:
             raise InputError(f"'{self._published / pair.scene}.npz' lacks the pair {pair.id}")
         return self._fixed[pair.id]
-
-
-def _load_points(path: Path) -> FloatArray:
-    return load_fragment(path).file_points
 
 
 def _describe(path: Path) -> tuple[Float32Array, Float32Array]:

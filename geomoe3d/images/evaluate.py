@@ -28,6 +28,7 @@ from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
 from geomoe3d.images.scenes import choose_pairs, images_in, read_scene
+from geomoe3d.runtime.plain import plain
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray
 
@@ -327,13 +328,5 @@ def _with_intervals(measure: Measure) -> str:
 
 def to_json(outcomes: Sequence[Outcome], table: dict[str, dict[str, Measure]]) -> dict[str, Any]:
     """Summary and every outcome as plain values; infinite and undefined numbers as None."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(one) for key, one in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [plain(one) for one in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
     summary = {name: {what: asdict(m) for what, m in row.items()} for name, row in table.items()}
-    return {"summary": plain(summary), "pairs": [plain(asdict(one)) for one in outcomes]}
+    return {"summary": plain(summary), "pairs": plain([asdict(one) for one in outcomes])}

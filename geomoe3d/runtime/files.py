@@ -11,6 +11,7 @@ import errno
 import hashlib
 import os
 import secrets
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -132,16 +133,40 @@ def refusals(message: str) -> Iterator[None]:
     """What the system refuses inside is an `OutputError`: the message, and the reason."""
     try:
         yield
-    except OutputError:
+    except GeoMoE3DError:
         raise
     except OSError as error:
-        raise OutputError(f"{message}: {_reason(error)}") from None
+        raise OutputError(f"{message}: {_reason(error)}") from error
 
 
 def make_folder(folder: Path) -> None:
     """Make a folder if it is not there, and those that it lies in. Raises OutputError: it cannot be made."""
     with refusals(f"cannot make the folder '{folder}'"):
         folder.mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def new_folder(folder: Path, what: str) -> Iterator[Path]:
+    """A hidden folder to be filled, which then takes the name ``folder``: completely or not at all.
+
+    Args:
+        folder: that is not there yet; its parent must exist.
+        what: the word for it in messages.
+
+    Raises:
+        OutputError: it is there, or the system refuses.
+    """
+    if folder.exists():
+        raise OutputError(f"'{folder}' exists; remove it to make it anew, or give another name")
+    temporary = folder.with_name(f".writing-{folder.name}")
+    shutil.rmtree(temporary, ignore_errors=True)  # the rest of a run that was killed
+    try:
+        with refusals(f"cannot write {what} '{folder}'"):
+            temporary.mkdir()
+            yield temporary
+            temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def remove(paths: Iterable[Path]) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -291,7 +290,7 @@ def training_loader(
         num_workers=config.workers,
         collate_fn=make_batch,
         prefetch_factor=config.data.prefetch if config.workers else None,
-        worker_init_fn=partial(_worker_init),
+        worker_init_fn=_worker_init,
     )
 
 

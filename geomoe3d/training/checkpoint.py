@@ -68,7 +68,11 @@ def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: 
             f"({keys}); train into another folder"
         ) from None
     differing = differences(before.model_dump(mode="json"), config.model_dump(mode="json"))
-    changed = {key: values for key, values in differing.items() if not _is_free(key)}
+    changed = {
+        key: values
+        for key, values in differing.items()
+        if not any(f"{key}.".startswith(f"{free}.") for free in FREE_KEYS)
+    }
     if changed:
         raise CheckpointError(
             f"'{path}' was made with other settings; set them back, or train into another folder (start from these "
@@ -76,7 +80,3 @@ def check_same_run(state: dict[str, Any], config: TrainConfig, data: str, path: 
         )
     if state["data"] != data:
         raise CheckpointError(f"'{path}' was trained on other data: {state['data']}, now {data}")
-
-
-def _is_free(key: str) -> bool:
-    return any(key == free or key.startswith(free + ".") for free in FREE_KEYS)

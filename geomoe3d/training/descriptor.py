@@ -20,7 +20,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from geomoe3d.config import Section
+from geomoe3d.config import Section, yaml_text
 from geomoe3d.errors import CheckpointError
 from geomoe3d.features.learned import LEARNED, load_tensors
 from geomoe3d.runtime.files import make_folder, write_atomically, write_text
@@ -112,10 +112,7 @@ class DescriptorRun:
         if self.last_path.exists():
             self._resume()
         else:
-            import yaml
-
-            text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-            write_text(folder / "config.yaml", text, force=True)
+            write_text(folder / "config.yaml", yaml_text(config), force=True)
 
     @property
     def last_path(self) -> Path:
@@ -156,7 +153,7 @@ class DescriptorRun:
 
     def _update(self, batch: ContrastBatch) -> Tensor:
         """One step; loss and share found."""
-        falling = 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * self._done()))
+        falling = 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * self.step / self.config.steps))
         rate = min(1.0, (self.step + 1) / 100) * falling
         for group in self.optimizer.param_groups:
             group["lr"] = rate * self.config.learning_rate
@@ -169,10 +166,6 @@ class DescriptorRun:
         torch._foreach_lerp_(list(self.averaged.parameters()), list(self.network.parameters()), 1 - keep)
         self.step += 1
         return torch.stack([loss.detach(), share])
-
-    def _done(self) -> float:
-        """Share of the schedule behind us."""
-        return self.step / self.config.steps
 
     def _loss(self, network: DescriptorNetwork, batch: ContrastBatch) -> tuple[Tensor, Tensor]:
         features = network(batch.view).view(len(batch.apart), -1, LEARNED)

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import secrets
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import FormatError, InputError, OutputError
+from geomoe3d.errors import FormatError, InputError
+from geomoe3d.runtime.files import new_folder
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, Float32Array, FloatArray
 
@@ -191,8 +190,6 @@ def write_shard(path: str | Path, pairs: Sequence[TrainingPair]) -> None:
         InputError: no pairs, or some have a channel that others lack.
     """
     path = Path(path)
-    if path.exists():
-        raise OutputError(f"'{path}' exists; remove it or give another name")
     if not pairs:
         raise InputError("a shard needs at least one pair")
     arrays: dict[str, NDArray[Any]] = {
@@ -210,16 +207,9 @@ def write_shard(path: str | Path, pairs: Sequence[TrainingPair]) -> None:
             arrays[name] = np.stack(given) if name == "viewpoints" else np.concatenate(given)
         if given and name == "motions":
             arrays["motion_start"] = np.cumsum([0, *map(len, given)]).astype(np.int64)
-    temporary = path.with_name(f".writing-{secrets.token_hex(8)}")
-    try:
-        temporary.mkdir()
+    with new_folder(path, "shard") as temporary:
         for name, array in arrays.items():
             np.save(temporary / f"{name}.npy", array)
-        temporary.rename(path)
-    except OSError as error:
-        raise OutputError(f"cannot write shard '{path}': {error.strerror}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _read(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:

@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch.nn.parallel import DistributedDataParallel
 
+from geomoe3d.config import yaml_text
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, OutputError
 from geomoe3d.networks.build import Network, build_network
 from geomoe3d.networks.pretrained import load_network, save_pretrained
@@ -92,7 +93,7 @@ class TrainingRun:
         if self.last_path.exists():
             self._resume()
         elif self.process.is_first:
-            write_text(self.folder / "config.yaml", _yaml(config), force=True)
+            write_text(self.folder / "config.yaml", yaml_text(config), force=True)
         self.process.wait()
 
     @property
@@ -272,9 +273,3 @@ class TrainingRun:
 
 
 _BEST_MEASURE = {"recall": "registration_recall", "f1": "f1", "verdict": "verdict_recall"}
-
-
-def _yaml(config: TrainConfig) -> str:
-    import yaml
-
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from report_runs import report
 
-from geomoe3d.evaluation.report_figures import Series, draw, figures, share_below, time_bars
+from geomoe3d.evaluation.report_drawing import Series, draw
+from geomoe3d.evaluation.report_figures import figures, share_below, time_bars
 
 
 def coordinates(path: str) -> list[tuple[float, float]]:

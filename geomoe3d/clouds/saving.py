@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomoe3d.clouds.formats import e57, gltf, las, meshes
+from geomoe3d.clouds.formats import e57, gltf, las, mesh_writers, meshes
 from geomoe3d.clouds.formats.objects import points_array
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import CLOUD_WRITERS, MESH_WRITERS, take_inherited
@@ -231,7 +231,7 @@ def _save_aligned(
         file is not None and suffix == ".glb" and kind in (".glb", ".gltf")
     ):
         read_raw(file)  # refuses what is damaged
-        whole = gltf.moved_glb(file, T) if suffix == ".glb" else meshes.moved_obj(file, T, path)
+        whole = gltf.moved_glb(file, T) if suffix == ".glb" else mesh_writers.moved_obj(file, T, path)
         _write(path, lambda handle: handle.write(whole), force)
         if suffix == ".obj" and b"mtllib" in whole and file.resolve().parent != path.resolve().parent:
             remark(f"{path} takes its materials from {file.resolve().parent}; move them along with it")
@@ -246,7 +246,9 @@ def _save_aligned(
         lost.append("faces")
         raw = RawCloud(meshes.sample_surface(raw, 100_000, 0, what)) if sampled else replace(raw, faces=None)
     if as_mesh and suffix == ".glb":
-        _write(path, lambda handle: meshes.write_glb(handle, meshes.scene_of(source, raw), T), force)
+        _write(
+            path, lambda handle: mesh_writers.write_glb(handle, mesh_writers.scene_of(source, raw), T), force
+        )
         kept = ("texture coordinates", "materials")
         return tuple(
             n for n in (*lost, *(["normals"] * (raw.normals is not None)), *raw.fields) if n not in kept
@@ -293,7 +295,7 @@ def _moved(raw: RawCloud, T: FloatArray) -> tuple[RawCloud, tuple[str, ...]]:
 
     (0, 0, 0) stays where it marks missing measurements.
     """
-    points = meshes.move_points(raw.points, T)
+    points = mesh_writers.move_points(raw.points, T)
     at_zero = ~raw.points.any(axis=1)
     if raw.faces is None and np.count_nonzero(at_zero) > 1:
         points[at_zero] = 0.0

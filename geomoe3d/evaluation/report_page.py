@@ -26,7 +26,8 @@ from geomoe3d.evaluation import report_words
 from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.metrics import has_motion
 from geomoe3d.evaluation.records import EvaluationPair, PairScore, Prediction, RunScore
-from geomoe3d.evaluation.report_figures import NUM_COLORS, figures, is_unrelated, time_bars
+from geomoe3d.evaluation.report_drawing import NUM_COLORS
+from geomoe3d.evaluation.report_figures import figures, is_unrelated, time_bars
 from geomoe3d.evaluation.report_words import benchmark_rank, recall_of, run_key, warnings
 from geomoe3d.evaluation.summary import title
 from geomoe3d.geometry.se3 import shift_frames, transform_points

@@ -10,9 +10,12 @@ from click.testing import CliRunner
 
 from geomoe3d.cli.register import command
 from geomoe3d.clouds.viewpoint import check_both_known, find_viewpoints, seen_by_none, with_sensors
+from geomoe3d.config import PreparationConfig
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision.confidence import Judgement
+from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import ConfigError, InputError
-from geomoe3d.types import PointCloud
+from geomoe3d.types import PointCloud, PreparedCloud
 
 FAR = np.array([500.0, -20.0, 3.0])
 
@@ -69,3 +72,11 @@ def test_the_command_line_takes_places(tmp_path: Path) -> None:
     for wrong in ("1,2", "here", "1,2,x"):
         refused = CliRunner().invoke(command, [*paths, "--sensor-source", wrong])
         assert refused.exit_code == 2 and "X,Y,Z" in refused.output
+
+
+def test_what_is_advised_where_sensors_are_guessed_names_the_verb_that_has_the_option() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    cloud = PreparedCloud(points, points, None, 0.1, None, np.zeros(3))
+    doubtful = Judgement("low_confidence", (), 0.5)
+    (said,) = remarks((points, points[::-1]), (cloud, cloud), 0.1, False, PreparationConfig(), doubtful)
+    assert said.index("preparation.viewpoint=origin") < said.index("`geomoe3d register` with --sensor-source")

@@ -9,8 +9,10 @@ import pytest
 
 from geomoe3d import register_pairs
 from geomoe3d.batch.folder import page_name, transform_name
-from geomoe3d.batch.store import results_table
+from geomoe3d.batch.run import BatchReport
+from geomoe3d.batch.store import Outcome, results_table
 from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
+from geomoe3d.cli.batch import table
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.runtime.csv_text import csv_text
 
@@ -123,3 +125,12 @@ def test_no_text_of_a_table_is_a_formula():
     assert text == "id,a,b,c,d\n'=1+1,'@x,'+a,'-b,'\tc\n-1.5,-2.5,a=b,,\n"
     record = {"id": "=1+1", "error": "@no", "result": None}
     assert results_table([record]).splitlines()[1] == f"'=1+1,error{',' * 19}'@no"
+
+
+def test_the_summary_names_pairs_whole(tmp_path):
+    name = "building A/scan 17 of the north wing" + "+" + "building A/scan 18 of the north wing"
+    report = BatchReport(
+        tmp_path, (Outcome(name, None, "cannot be read"), Outcome("b", None, "nor this")), 2, 0
+    )
+    assert f"  {name}  0.00  error" in table(report)
+    assert "\n  b  " in table(report)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from geomoe3d.runtime.plain import plain
+from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.runtime.words import counted
 
 
@@ -13,3 +16,16 @@ from geomoe3d.runtime.words import counted
 def test_numbers_of_things(number, said):
     assert counted(number, "pair") == said
     assert counted(number, "match", "matches") == said.replace("pair", "match" if number == 1 else "matche")
+
+
+def test_what_differs_is_told_without_hashes_and_in_a_few_words():
+    stored = {"seed": 0, "code": "a" * 64, "parts": {"filter": {"weights": None}}, "size": 1, "step": 2}
+    wanted = {"seed": 1, "code": "b" * 64, "parts": {"filter": {"weights": "c" * 64}}, "size": 3, "step": 4}
+    assert in_words(differences(stored, wanted)) == (
+        "code; parts.filter.weights; seed (0 there, 1 now); and in 2 more"
+    )
+
+
+def test_what_json_does_not_know_becomes_what_it_knows():
+    given = {1: (np.float32(0.5), np.nan, np.arange(2)), "b": [np.bool_(True), float("inf"), None, "x"]}
+    assert plain(given) == {"1": [0.5, None, [0, 1]], "b": [True, None, None, "x"]}

@@ -100,7 +100,9 @@ def test_what_differs_is_never_ok_and_what_is_not_believed_has_no_scale() -> Non
     assert (
         told.reasons[1:] == ("so",) and "1.1 times" in told.reasons[0]
     )  # not two confidences in one verdict
-    for fine in (Scale(1.1, 0.08), Scale(1.05, 0.02), Scale(1.005, 0.0001), None):
+    for off in (Scale(1.025, 0.007), Scale(1.05, 0.018), Scale(1.08, 0.04)):
+        assert sure.with_scale(off).judgement.status == "low_confidence"
+    for fine in (Scale(1.1, 0.08), Scale(1.05, 0.02), Scale(1.025, 0.008), Scale(1.005, 0.0001), None):
         assert sure.with_scale(fine).judgement == sure.judgement
     doubtful = replace(sure, judgement=Judgement("ambiguous", ("no",), 0.1))
     assert doubtful.with_scale(Scale(1.1, 0.01)).judgement == doubtful.judgement

@@ -37,11 +37,15 @@ class Scale:
 
     @property
     def differs(self) -> bool:
-        """Whether the ratio is off 1 by more than one per cent and more than 2.6 deviations, or, beyond six per cent
-        and where the deviation is under five, more than 1.3."""
+        """Whether the ratio is off 1 by more than one per cent and by more standard deviations than chance gives: 3.5
+        below 3.5 per cent, by which fragments of one camera differ, else 2.6, and 1.3 beyond six per cent where the
+        deviation is under five."""
         off, known = abs(float(np.log(self.ratio))), expert().scale
-        unheard_of = off > known.unheard_of and self.sigma < known.firm
-        enough = known.significant / 2 if unheard_of else known.significant
+        enough = known.significant
+        if off < known.usual:
+            enough = known.significant_usual
+        elif off > known.unheard_of and self.sigma < known.firm:
+            enough /= 2
         return off > max(enough * self.sigma, known.tolerated)
 
     def exchanged(self) -> Scale:

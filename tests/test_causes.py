@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 from small_scans import scene
@@ -11,9 +13,14 @@ import geomoe3d
 from geomoe3d.clouds.loading import load_points, without_missing
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision.answer import Decision
+from geomoe3d.decision.causes import mirrored_axes
+from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.remarks import data_remarks
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.types import PointCloud
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.surfaces import SURFACES, Evidence
+from geomoe3d.types import Hypothesis, PointCloud
 
 
 def test_zeros_in_many_rows_are_missing_measurements_and_one_is_a_point() -> None:
@@ -58,3 +65,22 @@ def test_a_mirrored_cloud_is_named_and_never_ok() -> None:
     result = geomoe3d.register(turned, target.file_points[::3])
     assert not result.ok
     assert result.reasons[0].startswith("mirrored: with x of 'source' the other way round the clouds fit")
+
+
+@dataclass(frozen=True)
+class Liked:
+    factor: float
+
+
+@pytest.mark.parametrize(("surfaces", "told"), [(0.7, False), (1.2, True)])
+def test_furniture_that_repeats_fits_mirrored_too_so_the_clouds_must_be_surer(
+    surfaces: float, told: bool
+) -> None:
+    def decided(distinctiveness: float, liked: float) -> Decision:
+        scores = {SURFACES: Evidence(0.5, 0.5, distinctiveness, 0.0), "network": Liked(liked)}
+        answer = Hypothesis(np.eye(4), scores=scores)
+        return replace(Decision.failed(""), answer=answer, judgement=Judgement("ok", (), 0.98))
+
+    as_is, other = decided(0.5, 1.0), decided(surfaces, 30.0)
+    said = mirrored_axes(as_is, "a.ply", lambda: 0.1, lambda: other, StageClock())
+    assert (said is not None) == told

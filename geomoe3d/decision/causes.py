@@ -13,6 +13,7 @@ from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.surfaces import evidence_of
 from geomoe3d.types import PointCloud
 
 Register = Callable[[PointCloud, PointCloud], RegistrationResult]
@@ -66,11 +67,14 @@ def mirrored_axes(
     if agreeing() < known.mirrored_support:
         return None
     found = look()
-    score = 0.0 if decision.answer is None else decision.answer.score
     if found.judgement.status != "ok" or found.answer is None:
         return None
-    if found.answer.score < known.mirrored_lead * score:
-        return None
+    if decision.answer is not None:
+        # Of furniture that repeats, mirrored, the network may be far surer than of the answer: the clouds must be too.
+        scores = [(h.score, evidence_of(h).surface_score) for h in (found.answer, decision.answer)]
+        (score, surfaces), (least, least_surfaces) = scores
+        if score < known.mirrored_lead * least or surfaces < known.mirrored_surfaces * least_surfaces:
+            return None
     return (
         f"mirrored: with x of '{name}' the other way round the clouds fit clearly better; if one of "
         "them has left-handed axes (often two are exchanged), bring both to right-handed ones, since a rigid transform "

@@ -4,6 +4,7 @@
         [--beside CHECKOUT] [--option=--...]      the command, and that of another checkout in the same run
     python scripts/measure_multiway.py OUT --rooms FOLDER [--every N] ...    generated rooms instead
     python scripts/measure_multiway.py OUT --world ...                       facade 0-3 and captures 1-5
+    python scripts/measure_multiway.py OUT --building N ...                  N laser scans of a generated building
     python scripts/measure_multiway.py OUT --truth [--scene NAME ...]    how exact the published poses are
 
 Ground truth is used for scoring only. A fragment is placed rightly when its pose in the largest group is
@@ -33,6 +34,12 @@ import numpy as np
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import RegistrationConfig, load_config
+from geomoe3d.data.fusion import thin
+from geomoe3d.data.rooms.arrange import furnish
+from geomoe3d.data.rooms.scanner import TRIPOD, LaserScanner, stand_scanner
+from geomoe3d.data.rooms.scenes import Scene
+from geomoe3d.data.rooms.shell import build_shell, plan_flat
+from geomoe3d.data.rooms.solids import Solids
 from geomoe3d.data.threedmatch import (
     find_benchmark_root,
     find_data_root,
@@ -89,6 +96,31 @@ def generated_rooms(folder: Path, every: int) -> list[Room]:
         poses = np.loadtxt(place / "poses.txt").reshape(-1, 4, 4)
         rooms.append(Room(place.name, files, [{path.stem: poses[number(path.stem)] for path in files}]))
     return rooms
+
+
+def building(folder: Path, count: int) -> Room:
+    """Laser scans of a generated building of furnished rooms with doorways, four to a room.
+
+    Each stands within 8 m of one before, in the same room or another; written into the folder, unless they are there.
+    """
+    rng, per_room = np.random.default_rng(count), 4
+    plan, solids = plan_flat(rng, max(count // per_room, 1)), Solids()
+    for room in plan:
+        build_shell(rng, solids, room)
+        furnish(rng, solids, room, None, 20.0)
+    scene = Scene("primitives", "building", solids, [room.rect for room in plan])
+    scanner, truth, files = (
+        LaserScanner(TRIPOD.model_copy(update={"rings": 150, "azimuth_step_deg": 1.0})),
+        {},
+        [],
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, pose in enumerate(stand_scanner(rng, scene, count)):
+        files.append(folder / f"scan_{k}.npy")
+        truth[files[-1].stem] = pose
+        if not files[-1].exists():
+            np.save(files[-1], thin(scanner.scan(scene.rays, pose, np.random.default_rng((count, k))), 0.025))
+    return Room(folder.name, files, [truth])
 
 
 def world_rooms() -> list[Room]:
@@ -286,9 +318,12 @@ def main() -> None:
     parser.add_argument("--beside", metavar="CHECKOUT", help="another checkout, measured in the same run")
     parser.add_argument("--option", action="append", default=[], help="for this checkout alone; repeatable")
     parser.add_argument("--score-only", action="store_true", help="of models that are there")
+    parser.add_argument("--building", type=int, help="so many laser scans of a generated building")
     parser.add_argument("--truth", action="store_true", help="how far the surfaces move the published poses")
     given = parser.parse_args()
-    if given.rooms:
+    if given.building:
+        rooms = [building(Path(given.out) / f"building-{given.building}", given.building)]
+    elif given.rooms:
         rooms = generated_rooms(Path(given.rooms), given.every)
     else:
         rooms = world_rooms() if given.world else dev_rooms(given.scene, given.scans)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,6 +46,11 @@ def test_a_loop_that_does_not_close_is_told_with_what_it_is_off():
     assert {worst.scans[0], worst.scans[-1]} == {0, 4}
     assert worst.shift == pytest.approx(np.sqrt(3))
     assert len(set(worst.scans)) == len(worst.scans) >= 3
+    # What all others contradict is followed where registration was sure of it, and only there.
+    for confidence, told in ((0.995, True), (0.97, False)):
+        doubted = replace(turned, confidence=confidence, evidence=-9.0)
+        loops = find_loops(truth, [*edges, doubted], shapes, 0.05)
+        assert all(loop.closes for loop in loops) != told
 
 
 def test_a_scan_in_front_of_what_another_saw_contradicts_it():

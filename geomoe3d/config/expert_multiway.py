@@ -148,6 +148,13 @@ class ManyGroupsExpert(Section):
         0.25, "share", (0, 1), "of the worth of the best: a transform that the scans are asked about again"
     )
     loop_worth: float = constant(4.0, "log-odds", (0, 100), "of an edge whose loop is followed: about 0.98")
+    loop_confidence: float = constant(
+        0.99,
+        "probability",
+        (0, 1),
+        "of a pair whose loop is followed whatever the other pairs say",
+        "of 181 pairs of hotel_umd and lab_hj so sure all are right",
+    )
     loop_shift: float = constant(
         4.0,
         "voxels",

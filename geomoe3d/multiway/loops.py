@@ -42,12 +42,15 @@ def find_loops(poses: Poses, edges: Sequence[Edge], shapes: Sequence[Shape], vox
 
     Args:
         poses: of its scans.
-        edges: of all registered pairs; those between its scans and surer than 0.98 take part.
+        edges: of all registered pairs; those between its scans and surer than 0.98 take part, and
+            those that registration alone was surer of than 0.99.
         shapes: of all scans.
         voxel_size: of the common grid, cloud units.
     """
     known = expert().many_groups
-    sure = [e for e in edges if {e.source, e.target} <= poses.keys() and e.worth >= known.loop_worth]
+    inside = [e for e in edges if {e.source, e.target} <= poses.keys()]
+    # A pair that was sure by itself is followed though the others contradict it: they may be wrong alike.
+    sure = [e for e in inside if e.worth >= known.loop_worth or e.confidence >= known.loop_confidence]
     tree = spanning_tree(sure)
     beside: dict[int, list[tuple[int, Edge]]] = {}
     for edge in sure:

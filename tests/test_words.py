@@ -19,10 +19,10 @@ def test_numbers_of_things(number, said):
 
 
 def test_what_differs_is_told_without_hashes_and_in_a_few_words():
-    stored = {"seed": 0, "code": "a" * 64, "parts": {"filter": {"weights": None}}, "size": 1, "step": 2}
-    wanted = {"seed": 1, "code": "b" * 64, "parts": {"filter": {"weights": "c" * 64}}, "size": 3, "step": 4}
+    stored = {"code": "a" * 64, "parts": {"filter": {"weights": None}}, "seed": 0, "size": 1}
+    wanted = {"code": "b" * 64, "parts": {"filter": {"weights": "c" * 64}}, "seed": 1, "size": 3, "added": 4}
     assert in_words(differences(stored, wanted)) == (
-        "code; parts.filter.weights; seed (0 there, 1 now); and in 2 more"
+        "seed (0 there, 1 now); size (1 there, 3 now); code; and in 2 more"
     )
 
 

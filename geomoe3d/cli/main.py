@@ -50,7 +50,7 @@ class _Verbs(click.Group):
         if name not in VERBS and not name.startswith("-"):
             close = difflib.get_close_matches(name, VERBS, n=1)
             hint = f"did you mean '{close[0]}'?" if close else f"there are: {', '.join(VERBS)}"
-            ctx.fail(f"there is no verb '{name}'; {hint}")
+            ctx.fail(f"there is no command '{name}'; {hint}")
         return super().resolve_command(ctx, args)
 
 

@@ -64,11 +64,16 @@ def differences(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, tup
 
 
 def in_words(differing: dict[str, tuple[str, str]], most: int = 3, longest: int = 40) -> str:
-    """Differences in one line: the first few, with their values unless long (hashes), and how many more there are."""
-    told = [
-        f"{key} ({a} there, {b} now)" if max(len(a), len(b)) <= longest else key
-        for key, (a, b) in list(differing.items())[:most]
-    ]
+    """Differences in one line: the first few, with their values unless long (hashes), and how many more there are.
+
+    What has other values comes before what another version does not know, and before hashes.
+    """
+
+    def rank(key: str) -> tuple[bool, bool]:
+        return "absent" in differing[key], max(map(len, differing[key])) > longest
+
+    first = sorted(differing, key=rank)[:most]
+    told = [key if rank(key)[1] else "{} ({} there, {} now)".format(key, *differing[key]) for key in first]
     rest = len(differing) - len(told)
     return "; ".join(told) + (f"; and in {rest} more" if rest else "")
 

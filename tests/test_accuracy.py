@@ -148,8 +148,8 @@ def test_the_words_name_each_figure() -> None:
 @pytest.mark.parametrize(
     ("margin", "words"),
     [
-        (np.log(20), "the second look prefers this transform 20 times to the best different one"),
-        (-np.log(3), "the second look prefers the best different one 3 times to this transform"),
+        (np.log(20), "the second look prefers this transform to the best different one by a factor of 20"),
+        (-np.log(3), "the second look prefers the best different one to this transform by a factor of 3"),
     ],
 )
 def test_the_margin_stands_on_the_console_and_on_the_page(margin: float, words: str) -> None:

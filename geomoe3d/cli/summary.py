@@ -11,7 +11,7 @@ from geomoe3d.clouds.transform_files import has_transform, transform_text
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import CloudReport, FloatArray
-from geomoe3d.visual.accuracy_facts import accuracy_facts, length
+from geomoe3d.visual.accuracy_facts import accuracy_facts, length, margin_facts
 
 _COLORS = {"ok": "green", "low_confidence": "yellow", "ambiguous": "yellow", "failed": "red"}
 _MEANING = {
@@ -92,7 +92,7 @@ def _found(result: RegistrationResult, unit: str) -> list[str]:
     if not math.isfinite(result.voxel_size):
         return []
     return [
-        *(_row(name, text) for name, text in accuracy_facts(result, unit)),
+        *(_row(name, text) for name, text in (*accuracy_facts(result, unit), *margin_facts(result))),
         _row("inliers", _inliers(result, unit)),
         _row("runner-up", _alternative(result, unit)),
         _row("voxel size", f"{length(result.voxel_size, unit)}{_chosen(result)}"),

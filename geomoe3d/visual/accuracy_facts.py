@@ -21,10 +21,6 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
     """Name and text of each figure, lengths in the files' unit; no more than the overlap where nothing was measured."""
     found = result.accuracy
     facts = [] if result.scale == 1.0 else [("scale", _scale(result))]
-    margin = result.evidence.get("margin")
-    if margin is not None:
-        this, other = ("this transform", "the best different one")[:: 1 if margin >= 0 else -1]
-        facts.append(("margin", f"the second look prefers {this} {np.exp(abs(margin)):.3g} times to {other}"))
     if found is None:
         overlap = f"{result.overlap:.0%} of the source" if np.isfinite(result.overlap) else "not known"
         return [*facts, ("overlap", overlap)]
@@ -49,6 +45,15 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
             f"point, {found.sigma_rotation_deg:.2g} deg{metres if unit in ('', 'm') else ''}",
         ),
     ]
+
+
+def margin_facts(result: RegistrationResult) -> list[tuple[str, str]]:
+    """Name and text of the margin; nothing where a second look gave none."""
+    margin = result.evidence.get("margin")
+    if margin is None:
+        return []
+    this, other = ("this transform", "the best different one")[:: 1 if margin >= 0 else -1]
+    return [("margin", f"the second look prefers {this} to {other} by a factor of {np.exp(abs(margin)):.3g}")]
 
 
 def _rmse(value: float, unit: str) -> str:

@@ -20,7 +20,7 @@ from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import check_output, write_text
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, IntArray
-from geomoe3d.visual.accuracy_facts import accuracy_facts, length
+from geomoe3d.visual.accuracy_facts import accuracy_facts, length, margin_facts
 from geomoe3d.visual.drawing import (
     GROUP_COLORS,
     KEPT_COLOR,
@@ -197,6 +197,7 @@ def _facts(view: RegistrationView) -> list[tuple[str, str]]:
     share = f" ({result.num_inliers / result.num_correspondences:.1%})" if result.num_correspondences else ""
     return [
         *accuracy_facts(result, view.unit),
+        *margin_facts(result),
         (
             "inliers",
             f"{result.num_inliers:,} of {counted(result.num_correspondences, 'correspondence')}{share}",

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from geomoe3d.clouds.pair import Pair
-from geomoe3d.clouds.prepare import bounded_voxel_size, own_voxel_sizes, round_size
 from geomoe3d.clouds.viewpoint import check_both_known, known_viewpoints, seen_by_none, sign_breaks
+from geomoe3d.clouds.voxel_size import bounded_voxel_size, own_voxel_sizes, round_size
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.loading import without_missing
 from geomoe3d.clouds.order import in_order
-from geomoe3d.clouds.prepare import check_cloud, scale_mismatch
+from geomoe3d.clouds.prepare import check_cloud
 from geomoe3d.clouds.viewpoint import Sensors, with_sensors
+from geomoe3d.clouds.voxel_size import scale_mismatch
 from geomoe3d.config import RegistrationConfig, build_config, expert_in_force
 from geomoe3d.correspondence_registration import CorrespondenceRegistrar, check_rows
 from geomoe3d.decision.answer import failed_result

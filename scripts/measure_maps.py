@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from map_cases import ALIKE, CASES, Building, Query, Scan, tasks
 
-from geomoe3d.clouds.prepare import robust_extent
+from geomoe3d.clouds.voxel_size import robust_extent
 from geomoe3d.evaluation.intervals import wilson
 from geomoe3d.evaluation.metrics import motion_errors
 from geomoe3d.evaluation.peers import PEERS

@@ -57,5 +57,7 @@ def test_the_voxel_size_is_chosen_alike(registrar):
     sizes = set()
     for seed in SEEDS:
         noise = np.random.default_rng(seed).normal(0, MOVED * np.ptp(points, axis=0).max(), points.shape)
-        sizes.add(geomoe3d.clouds.prepare.choose_voxel_size(*2 * [geomoe3d.PointCloud(points + noise)], 3500))
+        sizes.add(
+            geomoe3d.clouds.voxel_size.choose_voxel_size(*2 * [geomoe3d.PointCloud(points + noise)], 3500)
+        )
     assert len(sizes) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geomoe3d.clouds.io import load_points
-from geomoe3d.clouds.prepare import voxel_keys
+from geomoe3d.clouds.voxel_grid import voxel_keys
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.sample import write_sample_pair
 from geomoe3d.errors import FormatError

@@ -11,22 +11,15 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from surface_pairs import corner
 
-from geomoe3d.clouds.prepare import (
+from geomoe3d.clouds.prepare import check_cloud, estimate_normals, orient_normals, prepare
+from geomoe3d.clouds.voxel_grid import drop_duplicates, drop_isolated, sorted_rows, voxel_keys, voxel_means
+from geomoe3d.clouds.voxel_size import (
     _size_for_count,
     bounded_voxel_size,
-    check_cloud,
     choose_voxel_size,
-    drop_duplicates,
-    drop_isolated,
-    estimate_normals,
-    orient_normals,
     own_voxel_sizes,
-    prepare,
     scale_mismatch,
-    sorted_rows,
     typical_spacing,
-    voxel_keys,
-    voxel_means,
 )
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import EmptyCloudError, InputError

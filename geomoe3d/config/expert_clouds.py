@@ -27,7 +27,7 @@ class LoadingExpert(Section):
 
 
 class PreparationExpert(Section):
-    """From points to a grid (`clouds/prepare.py`)."""
+    """From points to a grid (`clouds/voxel_size.py`, `clouds/voxel_grid.py`)."""
 
     extent_sample: int = constant(
         100_000,
@@ -121,7 +121,7 @@ class ViewpointExpert(Section):
 
 
 class ScatterExpert(Section):
-    """Whether points fill space as foliage does (`clouds/prepare.py`)."""
+    """Whether points fill space as foliage does (`clouds/voxel_size.py`)."""
 
     sample: int = constant(20_000, "points", (100, 100_000_000), "of the cloud, thinned evenly")
     radius: float = constant(2.5, "voxels", (0.5, 100), "of a point's surroundings")

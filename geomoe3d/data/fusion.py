@@ -139,7 +139,7 @@ def thin(points: FloatArray, grid: float) -> FloatArray:
 
     On sorted points this keeps the same ones as the thinned fragments of the benchmark.
     """
-    from geomoe3d.clouds.prepare import voxel_keys
+    from geomoe3d.clouds.voxel_grid import voxel_keys
 
     if not len(points):
         return points

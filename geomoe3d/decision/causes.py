@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from geomoe3d.clouds.prepare import robust_extent
+from geomoe3d.clouds.voxel_size import robust_extent
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.clouds.prepare import choose_voxel_size
+from geomoe3d.clouds.voxel_size import choose_voxel_size
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.types import PointCloud, PreparedCloud

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from geomoe3d.clouds.prepare import robust_extent
+from geomoe3d.clouds.voxel_size import robust_extent
 from geomoe3d.config import DecisionConfig, RegistrationConfig, expert
 from geomoe3d.decision.answer import failed_result
 from geomoe3d.decision.explanation import Explanation

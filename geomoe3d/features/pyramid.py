@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomoe3d.clouds.prepare import voxel_keys
+from geomoe3d.clouds.voxel_grid import voxel_keys
 from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.runtime.threads import usable_threads
 from geomoe3d.types import Float32Array, IntArray, PreparedCloud

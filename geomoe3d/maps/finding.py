@@ -12,8 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from geomoe3d.clouds.prepare import bounded_voxel_size, choose_voxel_size, prepare
+from geomoe3d.clouds.prepare import prepare
 from geomoe3d.clouds.viewpoint import find_viewpoints, seen_by_none
+from geomoe3d.clouds.voxel_size import bounded_voxel_size, choose_voxel_size
 from geomoe3d.config import expert
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError

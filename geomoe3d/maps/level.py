@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.clouds.prepare import drop_isolated, estimate_normals, orient_normals, voxel_means
+from geomoe3d.clouds.prepare import estimate_normals, orient_normals
 from geomoe3d.clouds.range_image import RangeImage
+from geomoe3d.clouds.voxel_grid import drop_isolated, voxel_means
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.features.base import Descriptor, with_features

@@ -13,14 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomoe3d.clouds.io import load_points
-from geomoe3d.clouds.prepare import (
-    check_cloud,
-    robust_extent,
-    round_size,
-    typical_spacing,
-)
+from geomoe3d.clouds.prepare import check_cloud
 from geomoe3d.clouds.recentre import choose_origin
 from geomoe3d.clouds.viewpoint import with_sensor
+from geomoe3d.clouds.voxel_size import robust_extent, round_size, typical_spacing
 from geomoe3d.config import RegistrationConfig, build_config, expert, expert_in_force
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
 from geomoe3d.decision.scale import ratios_to_metres, units_differ

@@ -11,7 +11,7 @@ from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.ply import write_ply
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.io import load_points
-from geomoe3d.clouds.prepare import voxel_keys
+from geomoe3d.clouds.voxel_grid import voxel_keys
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import BoolArray, FloatArray, IntArray

@@ -12,8 +12,9 @@ import numpy as np
 
 from geomoe3d.batch.table import kind_of
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
-from geomoe3d.clouds.prepare import bounded_voxel_size, check_cloud, choose_voxel_size
+from geomoe3d.clouds.prepare import check_cloud
 from geomoe3d.clouds.transform_files import load_transform
+from geomoe3d.clouds.voxel_size import bounded_voxel_size, choose_voxel_size
 from geomoe3d.config import PreparationConfig
 from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
 

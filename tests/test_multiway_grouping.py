@@ -131,6 +131,17 @@ def test_free_space_finds_the_right_motion_though_it_is_the_quietest():
     assert len(grown(shapes, [*wrong, right], start)) == 2  # no scan is asked
 
 
+def test_many_edges_that_are_wrong_alike_do_not_outvote_what_the_scans_saw():
+    shapes, truth, _, rng = graph()
+    start = [Group({k: truth[k] for k in range(4)}), Group({k: truth[k] for k in range(4, 8)})]
+    alias = anywhere(rng)
+    wrong = [
+        edge(j, i, inverse(truth[i]) @ alias @ truth[j], 0.9999, rng) for j in range(4, 8) for i in range(4)
+    ]
+    assert len(grown(shapes, wrong, start, lambda a, b, T: (T, -5.0))) == 1
+    assert len(grown(shapes, wrong, start, lambda a, b, T: (T, -9.0))) == 2
+
+
 def test_groups_bend_where_two_edges_far_apart_agree_but_for_drift():
     shapes, _, _, rng = graph(count=20)
     truth = {k: make_transform(np.eye(3), np.array([0.5 * k, 0.0, 0.0])) for k in range(20)}

@@ -185,7 +185,10 @@ class Growth:
                 one, other = (self._around(self.groups[k].poses, way.supporters, joined) for k in (a, b))
                 T, told = self._witness(one, other, None if way.bends else way.T_a_b)
                 way.T_a_b = way.T_a_b if way.bends else T
-                way.worth += told
+                # Scans of one place are deceived alike: what many say does not outvote what was seen through.
+                known = expert().many_groups
+                most = known.most_worth if told < known.hopeless else np.inf
+                way.worth = min(way.voices, most) + told
             way.weighed = True
         self._ways[a, b] = self._merged(self._ways[a, b], b)
 

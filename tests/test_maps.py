@@ -20,6 +20,7 @@ from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFil
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps import store
 from geomoe3d.maps.finding import Finder
+from geomoe3d.maps.locate import Search
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.places import Query
 
@@ -85,6 +86,23 @@ def test_the_twin_of_a_room_is_seen_though_the_first_place_fits_plainly(rooms, s
     found = Map.from_cloud(np.concatenate([room, room + AWAY]), voxel_size=GRID).locate(scan[0])
     assert found.status == "ambiguous"
     assert sorted(round(shift(place.T_map_scan, scan[1])) for place in found.places[:2]) == [0, 7]
+
+
+def test_a_copy_of_the_answers_place_is_found_though_no_window_of_the_scan_shows_it(rooms, scan, monkeypatch):
+    """The map itself says where it is alike: a scan that looks into one room alone is not ok for that."""
+    room = scanned(rooms[0], UTM, 1)
+    made = Map.from_cloud(np.concatenate([room, room + AWAY, room + 2 * AWAY]), voxel_size=GRID)
+
+    def windows(self, count, within=None, *, voters=None, _made=Query.windows):
+        found = _made(self, count, within, voters=voters)
+        return found if voters is not None else found[:1]
+
+    monkeypatch.setattr(Query, "windows", windows)
+    found = made.locate(scan[0])
+    assert found.status == "ambiguous"
+    assert found.places[1].relative_score > 0.8
+    monkeypatch.setattr(Search, "twins", lambda self, T, count: [])
+    assert made.locate(scan[0]).ok  # what it would be without
 
 
 def test_where_one_place_fits_plainly_only_windows_of_rivals_are_looked_into(house, scan, monkeypatch):

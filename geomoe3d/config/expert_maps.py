@@ -82,6 +82,9 @@ class MapsExpert(Section):
         "of a mean direction to the sensors below which they saw a surface from everywhere",
     )
     least_points: int = constant(3, "points", (3, 1_000_000), "of the map that must remain on a grid")
+    least_twin: int = constant(
+        30, "points", (3, 1_000_000), "of the map around a place, by which copies of it are sought"
+    )
     facing_neighbors: int = constant(10, "points", (2, 1000), "along which the signs of normals are carried")
 
 
@@ -156,6 +159,19 @@ class LocatingExpert(Section):
         (0, 1),
         "of the votes of a window with such a transform, from which another may hold one",
         "the windows of ten rooms that are one had 0.8 to 1 of the votes of the best",
+    )
+    twin_votes: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]] = constant(
+        (0.33, 0.6),
+        "share",
+        None,
+        "of the votes of a place for itself, from which a window may be its copy: far off, and where both share points",
+        "copies of a room had 0.35 to 0.9, other places of three rooms and of a building 0.1 to 0.32",
+    )
+    twin_voters: int = constant(
+        32, "points", (10, 1_000_000), "of the map around a place that vote for its copies"
+    )
+    twin_apart: float = constant(
+        1.5, "radii", (1, 100), "of a scan between a place and a window, within which they share points"
     )
     kept: tuple[Annotated[int, Field(ge=1, le=10_000)], Annotated[int, Field(ge=1, le=10_000)]] = constant(
         (12, 36), "candidates", None, "that are different, at first and later"

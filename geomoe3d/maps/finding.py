@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
@@ -71,24 +72,43 @@ class Finder:
         view = find_viewpoints(cloud, cloud, rule)[0]
         local = [shift_frames(T, -cloud.origin, -self.voxels.origin) for T in guesses]
         own, coarsest = self._grids(cloud)
-        search = self._begun(cloud, view, self.level_for(own, coarsest, expert().maps.asked_points), clock)
+        whole = self._begun(cloud, view, self.level_for(own, coarsest, expert().maps.asked_points), clock)
+        search, twinned = whole, False
         known: list[FloatArray] = []
         times = max(1.0, count / expert().maps.candidates)
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
-            if look in ("other", "finer"):
-                whole = look == "other"
-                level = self._other(search, cloud, own) if whole else self._around(search, known, own)
-                if level is None:
-                    continue
+            if twinned and look in (
+                "more",
+                "other",
+            ):  # the places are known; a finer grid may tell them apart
+                continue
+            if look == "other":
+                level = self._other(search, cloud, own)
+            elif look == "finer":
+                known = [*known, *(T for first in known[:1] for T in whole.twins(first, count))]
+                level = self._around(search, known, own)
+            else:
+                level = search.level
+            if level is None:
+                continue
+            if level is not search.level:
                 search = self._begun(cloud, view, level, clock)
-            asked = [*local, *known]
-            candidates = search.candidates(more=look != "quick", near=where, given=asked, times=times)
+            more = look != "quick"
+            candidates = search.candidates(more=more, near=where, given=[*local, *known], times=times)
             known = [h.T_target_source for h in likely(candidates, count)]
-            found = [search.look(Hypothesis(T), fully=look != "quick") for T in known]
+            found = [search.look(Hypothesis(T), fully=more) for T in known]
             if not found:
                 continue
+            first = max(found, key=attrgetter("score"))
+            if first.stood and look != "finer":
+                answers = [f.decision.answer for f in found if f.decision.answer is not None]
+                twins = whole.twins(first.decision.T_target_source, count)
+                twins = [T for T in twins if all(whole.differ(Hypothesis(T), answer) for answer in answers)]
+                found += [search.look(Hypothesis(T), fully=more) for T in twins]
+                known += twins
+                twinned = twinned or sum(f.stood for f in found) > 1
             latest, others = search.decide(found)
             if best is None or latest.sure or latest.confidence > best.confidence:
                 best, ranked = latest, others

@@ -41,11 +41,18 @@ class Found:
         pair: the scan, and the map around the place.
         decision: of the ordinary line there.
         sure: whether it was ok beside all rivals, before the scale was measured: more looks cannot help then.
+        stood: whether it was ok before it had rivals elsewhere.
     """
 
     pair: Pair
     decision: Decision
     sure: bool = False
+    stood: bool = False
+
+    @property
+    def score(self) -> float:
+        """Of the answer; none is worth nothing."""
+        return 0.0 if self.decision.answer is None else self.decision.answer.score
 
     @property
     def confidence(self) -> float:
@@ -135,6 +142,44 @@ class Search:
                 best.append((score, hypothesis))
         return best
 
+    def twins(self, T: FloatArray, count: int) -> list[FloatArray]:
+        """Transforms (4, 4) that put the scan where the map is as it is around a place, best first: in rooms that are
+        copies of one. The map's own surfaces are sought in it, which show more of a place than the scan does.
+
+        Args:
+            T: (4, 4) into the map, local coordinates: the place.
+            count: at most so many.
+        """
+        self._clock("twins")
+        level, known = self.level, expert().locating
+        center, points = transform_points(T, self.center[None])[0], level.points[level.rows]
+        near = np.flatnonzero(np.linalg.norm(points - center, axis=1) < self.reach)
+        if len(near) < expert().maps.least_twin:
+            return []
+        part = Compared(points[near], level.normals[level.rows[near]], level.features[near])
+        voters = part.features[:: math.ceil(len(near) / known.twin_voters)]
+        windows, query = (
+            self._query.windows(4 * count, voters=voters),
+            Query(part, level, seed=self.config.seed),
+        )
+        least = known.close * self._quick(T)
+        found: list[tuple[float, Hypothesis]] = []
+        for window in windows:
+            away = float(np.linalg.norm(window.center - center)) / self.reach
+            shares_points = away < known.twin_apart
+            if away < 1 or window.votes < known.twin_votes[shares_points] * windows[0].votes:
+                continue
+            moved = [h.T_target_source @ T for h in query.motions(window, 3)]
+            if moved:
+                twin = self._polished(max(moved, key=self._quick))
+                found.append((self._quick(twin, least), Hypothesis(twin)))
+        found = [(score, h) for score, h in found if score > least]
+        distinct: list[Hypothesis] = []
+        for _, h in sorted(found, key=lambda item: -item[0]):
+            if len(distinct) < count and all(self.differ(h, other) for other in distinct):
+                distinct.append(h)
+        return [h.T_target_source for h in distinct]
+
     def _proposed(
         self,
         windows: Sequence[Window],
@@ -191,7 +236,8 @@ class Search:
                 scorers["sight"] = Sight(self.level, self.scan.points[self._rows[::4]])
             selection = Selection(pair, scorers, self._line.refiner.about(pair), self.config, self._clock)
             selection.add([Hypothesis(T), *proposed])
-            return Found(pair, selection.decide())
+            decision = selection.decide()
+            return Found(pair, decision, stood=decision.judgement.status == "ok")
 
     def decide(self, found: Sequence[Found]) -> tuple[Found, list[Hypothesis]]:
         """The best of several places, judged beside all others, and the distinct answers of all, best first."""
@@ -230,7 +276,8 @@ class Search:
             scale = replace(scale, sigma=expert().locating.scale_deviation * scale.sigma)
         decision = decision.with_scale(scale)
         told = measure_accuracy(T, shared, pair.matched, pair.inlier_threshold)
-        return Found(pair, replace(decision, accuracy=told), sure), distinct
+        stood = best.decision.judgement.status == "ok"
+        return Found(pair, replace(decision, accuracy=told), sure, stood), distinct
 
     def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
         return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]

@@ -262,7 +262,7 @@ class Map:
         best, ranked = self._finder(cloud, scan, guesses, local, max(k, expert().maps.candidates), clock)
         if best is None or best.decision.answer is None:
             return self._nowhere(cloud, nowhere(cloud.name, self.name), clock)
-        decision = self._told(best.decision, cloud, clock)
+        decision = self._told(best, cloud, clock)
         result = finished_result(best.pair, decision, self.config, clock.stop())
         origins, top = (cloud.origin, self._voxels.origin), best.decision.answer.score
         places = tuple(
@@ -271,12 +271,10 @@ class Map:
         )
         return Location(result, places)
 
-    def _told(self, decision: Decision, cloud: PointCloud, clock: StageClock) -> Decision:
-        """A decision, with the unit in which the scan would be found where it is not ok."""
-        if decision.judgement.status == "ok":
-            return decision
-        units = self._in_other_unit(cloud, clock)
-        return decision if units is None else decision.with_note(units, first=True)
+    def _told(self, found: Found, cloud: PointCloud, clock: StageClock) -> Decision:
+        """What was decided, with the unit in which the scan would be found where it fits nowhere as it is."""
+        units = None if found.stood else self._in_other_unit(cloud, clock)
+        return found.decision if units is None else found.decision.with_note(units, first=True)
 
     def _in_other_unit(self, cloud: PointCloud, clock: StageClock) -> str | None:
         """A sentence where a scan that is not found lies in the map once it is brought to another unit, else None."""
@@ -415,4 +413,4 @@ def search_larger(
     made = Map(nothing, config=line.config, line=line).with_cloud(replace(world, sensor=None))
     guesses = [] if guess is None else [guess]
     found = made._finder(scan, scan, guesses, None, expert().maps.candidates, clock)[0]
-    return None if found is None else replace(found, decision=made._told(found.decision, scan, clock))
+    return None if found is None else replace(found, decision=made._told(found, scan, clock))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,6 +47,17 @@ class Window:
     votes: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """What is compared of a map, cell by cell: its rows in that order, where each cell begins, which cells make the
+    window around each, and the features (65, c) in that order."""
+
+    order: IntArray
+    starts: IntArray
+    members: list[list[int]]
+    features: Float32Array
+
+
 class Query:
     """A scan's compared points, and how they match the map.
 
@@ -63,56 +75,68 @@ class Query:
         self.radius = float(np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), 0.95))
 
     @single_blas_thread()
-    def windows(self, count: int, within: tuple[FloatArray, float] | None = None) -> list[Window]:
+    def windows(
+        self,
+        count: int,
+        within: tuple[FloatArray, float] | None = None,
+        *,
+        voters: Float32Array | None = None,
+    ) -> list[Window]:
         """The likeliest windows, none at the centre of another, best first.
 
         Args:
             count: at most so many.
             within: (3,) where the scan's centre is said to lie, local coordinates, and how far off at most.
+            voters: (n, 65) features that vote in place of the scan's.
         """
-        from scipy.spatial import cKDTree
-
-        level, edge = self.level.compared, self.radius / 1.5
+        level, cells = self.level.compared, self._cells
         limit = min(expert().places.voting, expert().places.most_votes // max(len(level.features), 1))
-        asked = self._scan.features[:: math.ceil(len(self._scan.features) / max(limit, 1))]
-        cells = np.floor(level.points / edge).astype(np.int64)
-        cells -= cells.min(0)
-        shape = cells.max(0) + 1
-        flat = np.ravel_multi_index(tuple(cells.T), tuple(shape))
-        order = np.argsort(flat, kind="stable")
-        starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
-        used = flat[order][starts]
-        sorted_features = np.ascontiguousarray(level.features[order].T)
-        places = np.stack(np.unravel_index(used, tuple(shape)), axis=1)
-        tree = cKDTree(places)
-        members = tree.query_ball_point(places, 1.25 * self.radius / edge + 1e-6, return_sorted=True)
+        voters = self._scan.features if voters is None else voters
+        asked = voters[:: math.ceil(len(voters) / max(limit, 1))]
         best = np.concatenate(
             each(
                 lambda start: np.maximum.reduceat(
-                    asked[start : start + _ROWS] @ sorted_features, starts, axis=1
+                    asked[start : start + _ROWS] @ cells.features, cells.starts, axis=1
                 ),
                 range(0, len(asked), _ROWS),
             )
         )
         by_cell = np.ascontiguousarray(best.T)
-        most = np.stack([by_cell[m].max(0) for m in members], axis=1)  # (asked, windows)
+        most = np.stack([by_cell[m].max(0) for m in cells.members], axis=1)  # (asked, windows)
         votes = _votes(most)
-        counts = np.add.reduceat(np.ones(len(order)), starts)
-        sums = np.add.reduceat(level.points[order], starts, axis=0)
-        ends = np.append(starts[1:], len(order))
+        counts = np.add.reduceat(np.ones(len(cells.order)), cells.starts)
+        sums = np.add.reduceat(level.points[cells.order], cells.starts, axis=0)
+        ends = np.append(cells.starts[1:], len(cells.order))
         found: list[Window] = []
         for k in np.argsort(-votes, kind="stable"):
             if len(found) == count:
                 break
-            m = members[k]
+            m = cells.members[k]
             center = sums[m].sum(0) / counts[m].sum()
             if within is not None and np.linalg.norm(center - within[0]) > within[1] + self.radius:
                 continue
             if any(np.linalg.norm(center - window.center) < 0.6 * self.radius for window in found):
                 continue
-            keys = np.concatenate([order[starts[j] : ends[j]] for j in m])
+            keys = np.concatenate([cells.order[cells.starts[j] : ends[j]] for j in m])
             found.append(Window(center, np.sort(keys), float(votes[k])))
         return found
+
+    @cached_property
+    def _cells(self) -> _Cells:
+        from scipy.spatial import cKDTree
+
+        level, edge = self.level.compared, self.radius / 1.5
+        cells = np.floor(level.points / edge).astype(np.int64)
+        cells -= cells.min(0)
+        shape = tuple(cells.max(0) + 1)
+        flat = np.ravel_multi_index(tuple(cells.T), shape)
+        order = np.argsort(flat, kind="stable")
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
+        places = np.stack(np.unravel_index(flat[order][starts], shape), axis=1)
+        members = cKDTree(places).query_ball_point(
+            places, 1.25 * self.radius / edge + 1e-6, return_sorted=True
+        )
+        return _Cells(order, starts, list(members), np.ascontiguousarray(level.features[order].T))
 
     def motions(self, window: Window, count: int, *, more: bool = False) -> list[Hypothesis]:
         """Motions into a window, best first, T_map_scan (4, 4) local coordinates of both.

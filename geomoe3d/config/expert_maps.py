@@ -161,7 +161,7 @@ class LocatingExpert(Section):
         "the windows of ten rooms that are one had 0.8 to 1 of the votes of the best",
     )
     twin_votes: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]] = constant(
-        (0.33, 0.6),
+        (0.33, 0.75),
         "share",
         None,
         "of the votes of a place for itself, from which a window may be its copy: far off, and where both share points",

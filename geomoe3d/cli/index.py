@@ -37,7 +37,7 @@ def command(
     """Prepare CLOUDS (files, or folders of them) as one map, the file OUT.map.
 
     `geomoe3d locate` finds scans in it. Called again with more clouds, or after an interruption, it reads only those
-    that are not in it yet. LAS and LAZ are read in pieces. With --poses each cloud is one scan in coordinates of its
+    that are not in it yet. LAS, LAZ, binary PLY and E57 are read in pieces. With --poses each cloud is one scan in coordinates of its
     own.
     """
     if len(inputs) < 2:

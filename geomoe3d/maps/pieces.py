@@ -1,4 +1,5 @@
-"""Clouds too large for memory, read in pieces: LAS and LAZ as they stream, E57 scan by scan, all else at once."""
+"""Clouds too large for memory, read in pieces: LAS, LAZ and binary PLY as they stream, E57 scan by scan; all else at
+once."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from typing import Any
 
 from geomoe3d.clouds.formats.e57 import read_scans
 from geomoe3d.clouds.formats.las import read_pieces
+from geomoe3d.clouds.formats.ply import read_ply_pieces
 from geomoe3d.clouds.io import load_points
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.columns import finite_rows
@@ -45,9 +47,10 @@ def pieces(cloud: Any, size: int) -> Pieces:
         InputError, FormatError, EmptyCloudError: as `load_points`; of a streamed file while it is read.
     """
     path = Path(cloud) if isinstance(cloud, (str, os.PathLike)) else None
-    stream = None if path is None else _STREAMED.get(path.suffix.lower())
-    if path is not None and stream is not None and path.is_file():
-        return Pieces(path.name, file_hash(path), lambda: _finite(path, stream(path, size)))
+    if path is not None and path.is_file():
+        stream = _STREAMED.get(path.suffix.lower())
+        if stream is not None and stream(path, size) is not None:
+            return Pieces(path.name, file_hash(path), lambda: _finite(path, stream(path, size) or iter(())))
     loaded = load_points(cloud)
     if path is not None:
         digest = file_hash(path)
@@ -71,7 +74,18 @@ def _scan_pieces(path: Path, size: int) -> Iterator[Piece]:
             yield scan.points[start : start + size], scan.sensor
 
 
-_STREAMED = {".las": _laser_pieces, ".laz": _laser_pieces, ".e57": _scan_pieces}
+def _ply_pieces(path: Path, size: int) -> Iterator[Piece] | None:
+    found = read_ply_pieces(path, size)
+    return None if found is None else ((points, None) for points in found)
+
+
+_STREAMED: dict[str, Callable[[Path, int], Iterator[Piece] | None]] = {
+    ".las": _laser_pieces,
+    ".laz": _laser_pieces,
+    ".e57": _scan_pieces,
+    ".ply": _ply_pieces,
+}
+"""None: the file has to be read at once."""
 
 
 def _finite(path: Path, given: Iterator[Piece]) -> Iterator[Piece]:

@@ -30,7 +30,7 @@ from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.clouds.formats.text import parse_numbers
 from geomoe3d.errors import FormatError
 from geomoe3d.runtime.words import counted
-from geomoe3d.types import IntArray
+from geomoe3d.types import FloatArray, IntArray
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -108,6 +108,34 @@ def read_ply(path: Path) -> RawCloud:
             "in it are wrong"
         )
     return cloud_of(scalars, columns, faces=_checked_faces(faces, vertex.count, path), unread=tuple(unread))
+
+
+def read_ply_pieces(path: Path, size: int) -> Iterator[FloatArray] | None:
+    """The coordinates (n, 3) of a binary file of vertices alone, at most ``size`` at a time; None: any other PLY, which
+    has to be read at once. Raises FormatError: as `read_ply`, before anything is read."""
+    with path.open("rb") as handle:
+        order, elements, _ = _read_header(handle, path)
+        begin = handle.tell()
+    held = [element for element in elements if element.count and element.properties]
+    lists = any(length is not None for element in held for _, _, length in element.properties)
+    names = [name for name, _, _ in held[0].properties] if held else []
+    if order == "=" or lists or [e.name for e in held] != ["vertex"] or not {"x", "y", "z"} <= set(names):
+        return None
+    (vertex,) = held
+    row = np.dtype([(f"{k}", order + kind) for k, (_, kind, _) in enumerate(vertex.properties)])
+    rows = (path.stat().st_size - begin) // row.itemsize
+    if rows != vertex.count:
+        raise wrong_count(path, vertex.count, rows, "rows of 'vertex'")
+    axes = [f"{names.index(axis)}" for axis in "xyz"]
+
+    def parts() -> Iterator[FloatArray]:
+        for start in range(0, vertex.count, size):
+            some = np.fromfile(
+                path, row, min(size, vertex.count - start), offset=begin + start * row.itemsize
+            )
+            yield np.column_stack([some[axis].astype(np.float64) for axis in axes])
+
+    return parts()
 
 
 def _declared(column: NDArray[Any], kind: str) -> NDArray[Any]:

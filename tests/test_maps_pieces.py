@@ -1,0 +1,48 @@
+"""Files of clouds that are read piece by piece into a map: what is read is what reading them at once gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from geomoe3d.clouds.io import load_points
+from geomoe3d.errors import FormatError
+from geomoe3d.maps.pieces import pieces
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_binary_ply_of_points_is_read_in_pieces(tmp_path, order):
+    row = np.dtype([("quality", "u1"), ("x", order + "f8"), ("y", order + "f8"), ("z", order + "f4")])
+    rows = np.zeros(2500, dtype=row)
+    rng = np.random.default_rng(0)
+    for axis in "xyz":
+        rows[axis] = rng.uniform(-50, 50, 2500)
+    rows["x"][7] = np.nan
+    kind = {"<": "little", ">": "big"}[order]
+    types = zip(("uchar", "double", "double", "float"), row.names, strict=True)
+    lines = ["ply", f"format binary_{kind}_endian 1.0", "element vertex 2500"]
+    lines += [*(f"property {name} {axis}" for name, axis in types), "element face 0", "end_header"]
+    path = tmp_path / "scan.ply"
+    path.write_bytes("\n".join(lines).encode() + b"\n" + rows.tobytes())
+    read = list(pieces(path, 1000).points())
+    assert [len(points) for points, _ in read] == [999, 1000, 500]
+    expected = load_points(path).file_points
+    np.testing.assert_array_equal(np.vstack([points for points, _ in read]), expected)
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(FormatError, match=r"2500.*2499"):
+        pieces(path, 1000)
+
+
+def test_a_ply_with_faces_or_in_text_is_read_at_once_as_elsewhere(tmp_path):
+    corners = np.random.default_rng(0).uniform(size=(60, 3))
+    text = tmp_path / "text.ply"
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 60\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    np.savetxt(text, corners, header=header + "end_header", comments="")
+    mesh = trimesh.Trimesh(corners, np.arange(60).reshape(20, 3), process=False)
+    mesh.export(tmp_path / "mesh.ply")
+    for path in (text, tmp_path / "mesh.ply"):
+        ((points, _),) = pieces(path, 10**6).points()
+        np.testing.assert_allclose(points, load_points(path).file_points, atol=1e-9)

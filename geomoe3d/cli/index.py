@@ -37,8 +37,8 @@ def command(
     """Prepare CLOUDS (files, or folders of them) as one map, the file OUT.map.
 
     `geomoe3d locate` finds scans in it. Called again with more clouds, or after an interruption, it reads only those
-    that are not in it yet. LAS, LAZ, binary PLY and E57 are read in pieces. With --poses each cloud is one scan in coordinates of its
-    own.
+    that are not in it yet. LAS, LAZ, binary PLY and E57 are read in pieces. With --poses each cloud is one scan in
+    coordinates of its own.
     """
     if len(inputs) < 2:
         raise click.UsageError("give at least one cloud, and OUT.map last")

@@ -78,8 +78,9 @@ class Map:
         """Describe a cloud as a map.
 
         Args:
-            cloud: anything `load_points` takes; LAS, LAZ, binary PLY and E57 are read in pieces, so that memory is bounded by
-                what the map keeps: four million voxels at most, on a grid twice as wide where that is not enough.
+            cloud: anything `load_points` takes; LAS, LAZ, binary PLY and E57 are read in pieces, so that memory is
+                bounded by what the map keeps: four million voxels at most, on a grid twice as wide where that is not
+                enough.
             sensor: (3,) where the one sensor stood, file coordinates; None takes what the file itself says, and none
                 where it says nothing, as merged clouds do; of an E57 file, what each of its scans says. The origin of
                 a map is never taken for one.

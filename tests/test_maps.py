@@ -250,8 +250,8 @@ def test_where_the_sensor_stood_may_be_given_and_is_then_believed(house, scan):
     others = [], []
     for sensor, normals in zip((None, "none"), others, strict=True):
 
-        def begun(self, cloud, view, level, clock, _made=Finder._begun, normals=normals):
-            search = _made(self, cloud, view, level, clock)
+        def begun(self, *given, _made=Finder._begun, normals=normals):
+            search = _made(self, *given)
             normals.append(search.scan.normals)
             return search
 

@@ -9,19 +9,21 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.config import PreparationConfig, expert
+from geomoe3d.config import PreparationConfig, RegistrationConfig, expert
 from geomoe3d.features.base import with_features
 from geomoe3d.features.learned import LearnedDescriptor
 from geomoe3d.features.multiscale import MultiscaleDescriptor
 from geomoe3d.features.pyramid import pyramid
 from geomoe3d.geometry.se3 import make_transform, transform_points
+from geomoe3d.maps import finding
 from geomoe3d.maps.facing import both_sides, facing_alike
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.locate import Search
 from geomoe3d.maps.places import Query, Window
 from geomoe3d.maps.sight import Sight, seen_through
 from geomoe3d.maps.voxels import VoxelSums
-from geomoe3d.types import PreparedCloud
+from geomoe3d.runtime.timing import StageClock
+from geomoe3d.types import PointCloud, PreparedCloud
 
 UTM = np.array([583394.0, 5283100.0, 498.0])
 
@@ -57,6 +59,7 @@ def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
     scan = SimpleNamespace(points=ends, normals=up)
     search = SimpleNamespace(
         level=level,
+        _sight=level,
         scan=scan,
         center=ends.mean(0),
         reach=1.0,
@@ -87,6 +90,36 @@ def test_where_a_sensor_of_the_map_saw_through_no_surface_stands():
     assert Sight(level, patch).factor(place) == 1.0
     unknown = Level.of(VoxelSums.empty(0.1, np.zeros(3)).added(grid), 0.1, PreparationConfig())
     assert not seen_through(unknown, patch + np.array([1.5, 0, 0])).any()
+
+
+def test_on_a_part_of_a_map_the_sensors_of_the_whole_are_asked(monkeypatch):
+    """The next room stands behind a wall at x = 3; where that was cut away, the sensor seems to see into the room."""
+    near, far = (
+        np.stack(np.meshgrid([x], np.arange(-2, 2, 0.1), np.arange(-1, 1, 0.1)), -1).reshape(-1, 3)
+        for x in (3.0, 6.0)
+    )
+    voxels = VoxelSums.empty(0.1, np.zeros(3)).added(near, np.zeros(3)).added(far)
+    whole = Level.of(voxels, 0.2, PreparationConfig())
+    part = Level.of(voxels.within(np.array([[5.5, 0.0, 0.0]]), 2.2), 0.1, PreparationConfig())
+    inside = np.random.default_rng(3).uniform(-0.3, 0.3, (50, 3)) * (0.1, 1, 1) + (4.5, 0, 0)
+    assert not seen_through(whole, inside).any()
+    assert seen_through(part, inside).all()
+
+    asked = []
+
+    def search(line, scan, compared, level, own, clock, sight=None):
+        asked.append((level, sight))
+        return SimpleNamespace(level=level, candidates=lambda **_: [])
+
+    monkeypatch.setattr(finding, "prepare", lambda *_, **__: None)
+    monkeypatch.setattr(finding, "described", lambda *_: (None, None))
+    monkeypatch.setattr(finding, "Search", search)
+    monkeypatch.setattr(finding.Finder, "_around", lambda *_: part)
+    line = SimpleNamespace(config=RegistrationConfig(), descriptor=None)
+    finder = finding.Finder(line, voxels, lambda *_: whole, "map")
+    scan = PointCloud(inside, np.zeros(3))
+    assert finder(scan, scan, [], None, 4, StageClock()) == (None, [])
+    assert asked == [(whole, None), (part, whole)]
 
 
 def test_voxels_are_those_of_the_whole_in_whatever_pieces():

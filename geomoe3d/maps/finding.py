@@ -79,10 +79,8 @@ class Finder:
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
-            if twinned and look in (
-                "more",
-                "other",
-            ):  # the places are known; a finer grid may tell them apart
+            # Once places that are alike are known, only a finer grid may tell them apart.
+            if twinned and look in ("more", "other"):
                 continue
             if look == "other":
                 level = self._other(search, cloud, own)
@@ -94,7 +92,7 @@ class Finder:
             if level is None:
                 continue
             if level is not search.level:
-                search = self._begun(cloud, view, level, clock)
+                search = self._begun(cloud, view, level, clock, whole.level if look == "finer" else None)
             more = look != "quick"
             candidates = search.candidates(more=more, near=where, given=[*local, *known], times=times)
             known = [h.T_target_source for h in likely(candidates, count)]
@@ -149,8 +147,15 @@ class Finder:
             return own, expert().maps.finer * own
         return own, max(own, choose_voxel_size(cloud, cloud, expert().maps.least_voxels))
 
-    def _begun(self, cloud: PointCloud, view: FloatArray | None, level: Level, clock: StageClock) -> Search:
-        """The search for a scan on a level."""
+    def _begun(
+        self,
+        cloud: PointCloud,
+        view: FloatArray | None,
+        level: Level,
+        clock: StageClock,
+        sight: Level | None = None,
+    ) -> Search:
+        """The search for a scan on a level; ``sight`` as of `Search`."""
         clock("preprocess")
         config = self.line.config.preparation
         if seen_by_none((cloud, cloud)):
@@ -158,7 +163,7 @@ class Finder:
         bare = prepare(cloud, level.voxel_size, config, viewpoint=view, seed=self.line.config.seed)
         clock("features")
         scan, compared = described(bare, self.line.descriptor)
-        return Search(self.line, scan, compared, level, self._part(level), clock)
+        return Search(self.line, scan, compared, level, self._part(level), clock, sight)
 
     def _part(self, level: Level) -> PreparedCloud:
         nothing = np.zeros((0, 3))

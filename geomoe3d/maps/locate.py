@@ -1,9 +1,10 @@
 """One scan in a map: candidate places, the ordinary line at the best of them, one decision.
 
-A map has no sensor, so its surfaces have no front. Under a motion the scan's sensor has a place in the map, and what
+A map has no one sensor, so its surfaces have no front. Under a motion the scan's sensor has a place in the map, and what
 was matched was seen from there: the map around a candidate is cut out, turned to that place, described and compared
 like another scan. Before that a quick look tells good candidates from bad ones: a scan lies in its map with all of
-its surface, and nothing of the map may stand where the scan's sensor looked through.
+its surface, nothing of the map may stand where the scan's sensor looked through, and nothing of the scan where those of
+the map did.
 """
 
 from __future__ import annotations
@@ -70,6 +71,8 @@ class Search:
         level: of the map.
         part: of what is cut out of the map: its name, origin and counts; its arrays are replaced.
         clock: told of the stages.
+        sight: the map as a whole where ``level`` is a part of it: its sensors are asked there, since in the part alone
+            they would seem to have looked through walls that were cut away. None: the level.
     """
 
     def __init__(
@@ -80,7 +83,9 @@ class Search:
         level: Level,
         part: PreparedCloud,
         clock: StageClock,
+        sight: Level | None = None,
     ) -> None:
+        self._sight = level if sight is None else sight
         self._line, self.level, self._part, self._clock = line, level, part, clock
         self.config: RegistrationConfig = line.config
         self.scan = scan
@@ -158,10 +163,8 @@ class Search:
             return []
         part = Compared(points[near], level.normals[level.rows[near]], level.features[near])
         voters = part.features[:: math.ceil(len(near) / known.twin_voters)]
-        windows, query = (
-            self._query.windows(4 * count, voters=voters),
-            Query(part, level, seed=self.config.seed),
-        )
+        windows = self._query.windows(4 * count, voters=voters)
+        query = Query(part, level, seed=self.config.seed)
         least = known.close * self._quick(T)
         found: list[tuple[float, Hypothesis]] = []
         for window in windows:
@@ -232,8 +235,8 @@ class Search:
             pair = self._line.match((self.scan, target), None, self._clock)
             _, proposed = self._line.propose(pair, self._clock)
             scorers = dict(self._line.scorers)
-            if scorers and len(self.level.sensors):
-                scorers["sight"] = Sight(self.level, self.scan.points[self._rows[::4]])
+            if scorers and len(self._sight.sensors):
+                scorers["sight"] = Sight(self._sight, self.scan.points[self._rows[::4]])
             selection = Selection(pair, scorers, self._line.refiner.about(pair), self.config, self._clock)
             selection.add([Hypothesis(T), *proposed])
             decision = selection.decide()
@@ -319,7 +322,7 @@ class Search:
         cosine = np.abs(np.einsum("ij,ij->i", normals, level.normals[np.asarray(nearest)[hit]]))
         agreement = float((cosine > expert().surfaces.least_cosine).sum() / len(moved))
         if agreement > least:
-            agreement *= seen_factor(level, moved[~hit], len(moved))
+            agreement *= seen_factor(self._sight, moved[~hit], len(moved))
         if self._view is None or agreement <= least:
             return agreement
         near = level.tree.query_ball_point(transform_points(T, self.center[None])[0], self.reach)

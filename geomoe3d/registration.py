@@ -222,7 +222,8 @@ def register(
 
     Raises:
         InputError: a cloud that cannot be read or has too few usable points, a guess that is no rigid
-            transform, correspondences that are no (N, 6) finite numbers, or a sensor that is no place.
+            transform, correspondences that are no (N, 6) finite numbers, a sensor that is no place, or the place of
+            one sensor where that of the other is not known.
         ConfigError: an unknown or invalid override, a guess where nothing scores or the scale is estimated, or a sensor
             where ``preparation.viewpoint`` is not auto.
     """

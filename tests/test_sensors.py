@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import geomoe3d
 from geomoe3d.cli.register import command
 from geomoe3d.clouds.viewpoint import check_both_known, find_viewpoints, seen_by_none, with_sensors
 from geomoe3d.config import PreparationConfig
@@ -53,6 +54,8 @@ def test_what_is_no_place_is_refused(sensor: object) -> None:
 def test_one_place_alone_is_refused_where_the_other_is_not_known(sensors: tuple) -> None:
     with pytest.raises(InputError, match="one alone is of no use"):
         check_both_known(with_sensors(clouds(), sensors, "auto"))
+    with pytest.raises(InputError, match="one alone is of no use"):
+        geomoe3d.register(*clouds(), sensors=sensors)
 
 
 def test_a_place_and_another_rule_exclude_each_other() -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.option(
     "--poses",
     metavar="FILE",
-    help="Where each cloud lies in the map (TUM, KITTI or JSON). [all are in one coordinate system]",
+    help="Where each cloud lies in the map, in their order (TUM, KITTI or JSON). [all are in one coordinate system]",
 )
 @configuration_options
 @click.option("--fresh", is_flag=True, help="Begin anew where OUT.map exists; else clouds are added to it.")

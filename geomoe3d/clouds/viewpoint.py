@@ -54,7 +54,8 @@ def known_viewpoints(
 def with_sensors(
     clouds: tuple[PointCloud, PointCloud], sensors: Sensors, rule: str
 ) -> tuple[PointCloud, PointCloud]:
-    """Source and target, of whose sensors the user knows something; see `with_sensor`, each of ``sensors`` as there."""
+    """Source and target, of whose sensors the user knows something; each of ``sensors``, ``rule`` and the errors
+    (InputError, ConfigError) are as of `with_sensor`."""
     source, target = (
         with_sensor(cloud, sensor, rule, whose)
         for cloud, sensor, whose in zip(clouds, sensors, ("source", "target"), strict=True)

@@ -123,7 +123,7 @@ class ManyGroupsExpert(Section):
         -6.0,
         "log-odds",
         (-1000, 0),
-        "by free space, below which surfaces are not asked: laying them on each other wins back three at most",
+        "by free space, below which surfaces, which win back three at most, are not asked, and many edges count as one",
     )
     most_transforms: int = constant(
         8, "transforms", (1, 100), "of two groups that are weighed against each other"

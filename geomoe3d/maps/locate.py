@@ -1,10 +1,10 @@
 """One scan in a map: candidate places, the ordinary line at the best of them, one decision.
 
-A map has no one sensor, so its surfaces have no front. Under a motion the scan's sensor has a place in the map, and what
-was matched was seen from there: the map around a candidate is cut out, turned to that place, described and compared
-like another scan. Before that a quick look tells good candidates from bad ones: a scan lies in its map with all of
-its surface, nothing of the map may stand where the scan's sensor looked through, and nothing of the scan where those of
-the map did.
+A map has no one sensor, so its surfaces have no front. Under a motion the scan's sensor has a place in the map, and
+what was matched was seen from there: the map around a candidate is cut out, turned to that place, described and
+compared like another scan. Before that a quick look tells good candidates from bad ones: a scan lies in its map with
+all of its surface, nothing of the map may stand where the scan's sensor looked through, and nothing of the scan where
+those of the map did.
 """
 
 from __future__ import annotations

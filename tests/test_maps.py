@@ -92,6 +92,11 @@ def test_a_copy_of_the_answers_place_is_found_though_no_window_of_the_scan_shows
     """The map itself says where it is alike: a scan that looks into one room alone is not ok for that."""
     room = scanned(rooms[0], UTM, 1)
     made = Map.from_cloud(np.concatenate([room, room + AWAY, room + 2 * AWAY]), voxel_size=GRID)
+    for copy in range(3):  # who says in which of them it is gets that one
+        there = scan[1][:3, 3] + copy * AWAY
+        found = made.locate(scan[0], near=there, within=2.0)
+        assert found.ok
+        assert np.linalg.norm(found.T_map_scan[:3, 3] - there) < 0.05
 
     def windows(self, count, within=None, *, voters=None, _made=Query.windows):
         found = _made(self, count, within, voters=voters)

@@ -104,6 +104,8 @@ class Finder:
                 answers = [f.decision.answer for f in found if f.decision.answer is not None]
                 twins = whole.twins(first.decision.T_target_source, count)
                 twins = [T for T in twins if all(whole.differ(Hypothesis(T), answer) for answer in answers)]
+                if where is not None:  # of rooms that are alike, the caller says in which the scan is
+                    twins = [T for T in twins if search.is_near(T, where)]
                 found += [search.look(Hypothesis(T), fully=more) for T in twins]
                 known += twins
                 twinned = twinned or sum(f.stood for f in found) > 1

@@ -209,7 +209,7 @@ class Search:
                 continue
             proposed = self._query.motions(window, known.per_window[more], more=more)
             if near is not None:
-                proposed = [h for h in proposed if self._is_near(h.T_target_source, near)]
+                proposed = [h for h in proposed if self.is_near(h.T_target_source, near)]
             least = known.worth_polishing * max((q for q, _ in scored), default=0.0)
             fresh = [(self._quick(h.T_target_source, least), h) for h in proposed]
             scored += fresh
@@ -282,7 +282,8 @@ class Search:
         stood = best.decision.judgement.status == "ok"
         return Found(pair, replace(decision, accuracy=told), sure, stood), distinct
 
-    def _is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
+    def is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
+        """Whether a transform (4, 4) puts the scan's sensor where it is said to be; ``near`` as of `candidates`."""
         return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]
 
     def _polished(self, T: FloatArray) -> FloatArray:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.formats.registry import READERS
+from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.errors import FormatError
 from geomoe3d.maps.pieces import pieces
 
@@ -46,3 +47,12 @@ def test_a_ply_with_faces_or_in_text_is_read_at_once_as_elsewhere(tmp_path):
     for path in (text, tmp_path / "mesh.ply"):
         ((points, _),) = pieces(path, 10**6).points()
         np.testing.assert_allclose(points, load_points(path).file_points, atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".las"])
+def test_a_reader_of_the_users_own_is_asked_for_a_map_too(tmp_path, monkeypatch, suffix):
+    points = np.random.default_rng(0).uniform(size=(60, 3))
+    save_points(tmp_path / f"scan{suffix}", points)
+    monkeypatch.setitem(READERS, suffix, lambda path: points + 100.0)
+    ((read, _),) = pieces(tmp_path / f"scan{suffix}", 1000).points()
+    np.testing.assert_allclose(read, points + 100.0, atol=1e-9)

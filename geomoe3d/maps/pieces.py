@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.clouds.formats.e57 import read_scans
-from geomoe3d.clouds.formats.las import read_pieces
-from geomoe3d.clouds.formats.ply import read_ply_pieces
+from geomoe3d.clouds.formats.e57 import read_e57, read_scans
+from geomoe3d.clouds.formats.las import read_las, read_pieces
+from geomoe3d.clouds.formats.ply import read_ply, read_ply_pieces
+from geomoe3d.clouds.formats.registry import READERS, Reader, take_inherited
 from geomoe3d.clouds.io import load_points
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.columns import finite_rows
@@ -48,7 +49,8 @@ def pieces(cloud: Any, size: int) -> Pieces:
     """
     path = Path(cloud) if isinstance(cloud, (str, os.PathLike)) else None
     if path is not None and path.is_file():
-        stream = _STREAMED.get(path.suffix.lower())
+        take_inherited()
+        stream = _STREAMED.get(READERS.get(path.suffix.lower()))
         if stream is not None and stream(path, size) is not None:
             return Pieces(path.name, file_hash(path), lambda: _finite(path, stream(path, size) or iter(())))
     loaded = load_points(cloud)
@@ -79,13 +81,12 @@ def _ply_pieces(path: Path, size: int) -> Iterator[Piece] | None:
     return None if found is None else ((points, None) for points in found)
 
 
-_STREAMED: dict[str, Callable[[Path, int], Iterator[Piece] | None]] = {
-    ".las": _laser_pieces,
-    ".laz": _laser_pieces,
-    ".e57": _scan_pieces,
-    ".ply": _ply_pieces,
+_STREAMED: dict[Reader | None, Callable[[Path, int], Iterator[Piece] | None]] = {
+    read_las: _laser_pieces,
+    read_e57: _scan_pieces,
+    read_ply: _ply_pieces,
 }
-"""None: the file has to be read at once."""
+"""In place of a reader of ours, never of a user's own for the same suffix; None: the file has to be read at once."""
 
 
 def _finite(path: Path, given: Iterator[Piece]) -> Iterator[Piece]:

@@ -314,6 +314,9 @@ class Line:
             reason = nowhere(*(cloud.name for cloud in clouds))
             return Explanation(failed_result(clouds, reason, self.config, self.clock.stop()), *clouds)
         decision = found.decision
+        # A map that shows little more than the scan does in its unit says nothing plain of that; the pair does.
+        if decision.judgement.status != "ok" and (units := self._units(clouds)) is not None:
+            decision = decision.with_note(units, first=True)
         for remark in clouds[1].notes:
             decision = decision.with_note(remark)
         weighed = FilterOutput(np.zeros(len(found.pair.matched)))

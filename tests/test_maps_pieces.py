@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from geomoe3d.clouds.formats.e57 import write_scans
+from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import READERS
 from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.errors import FormatError
+from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps.pieces import pieces
 
 
@@ -56,3 +59,16 @@ def test_a_reader_of_the_users_own_is_asked_for_a_map_too(tmp_path, monkeypatch,
     monkeypatch.setitem(READERS, suffix, lambda path: points + 100.0)
     ((read, _),) = pieces(tmp_path / f"scan{suffix}", 1000).points()
     np.testing.assert_allclose(read, points + 100.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("far", "believed"), [(2.0, True), (500.0, False)])
+def test_a_pose_far_from_its_points_is_a_georeference_and_no_sensor(tmp_path, far, believed):
+    pytest.importorskip("pye57")
+    points = np.random.default_rng(1).uniform(0, 10, (300, 3))
+    place = np.array([far, 2.0, 1.5])
+    write_scans(
+        tmp_path / "merged.e57", [("merged", RawCloud(points - place), make_transform(np.eye(3), place))]
+    )
+    ((read, sensor),) = pieces(tmp_path / "merged.e57", 1000).points()
+    np.testing.assert_allclose(read, points, atol=1e-6)
+    assert (sensor is not None) == believed

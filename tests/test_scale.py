@@ -12,7 +12,7 @@ from surface_pairs import motion
 
 import geomoe3d
 from geomoe3d.clouds.prepare import prepare
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement
@@ -127,3 +127,11 @@ def test_two_units_are_named_where_the_clouds_fit_in_one(factor: float, unit: st
     assert f"'source' seems to be in {unit}, 'target' in metres" in said or (
         f"'target' seems to be in metres, 'source' in {unit}" in said
     )
+
+
+def test_units_are_named_also_where_the_larger_cloud_is_taken_for_a_map() -> None:
+    source, target, _ = make_sample_pair(seed=0)
+    config = load_config(None, ["expert.maps.larger_grid=1.5"])
+    result = geomoe3d.register(source.file_points / 0.3048, target, config=config)
+    assert not result.ok
+    assert result.reasons[0].startswith("units differ: ") and "in feet" in result.reasons[0]

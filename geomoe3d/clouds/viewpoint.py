@@ -136,7 +136,13 @@ def _believed(cloud: PointCloud) -> FloatArray | None:
     if cloud.sensor is None:
         return None
     place: FloatArray = cloud.sensor - cloud.origin
-    return place if _is_near(place, *bounds(cloud.points)) else None
+    return place if may_have_seen(cloud.points, place) else None
+
+
+def may_have_seen(points: FloatArray, place: FloatArray) -> bool:
+    """Whether a sensor at a place (3,) that a file names may have seen the points (n, 3), n > 0, of the same frame: one
+    farther off than their extent is a georeference."""
+    return _is_near(place, *bounds(points))
 
 
 def _is_near(place: FloatArray, low: FloatArray, high: FloatArray) -> bool:

@@ -15,6 +15,7 @@ from geomoe3d.clouds.formats.las import read_las, read_pieces
 from geomoe3d.clouds.formats.ply import read_ply, read_ply_pieces
 from geomoe3d.clouds.formats.registry import READERS, Reader, take_inherited
 from geomoe3d.clouds.io import load_points
+from geomoe3d.clouds.viewpoint import may_have_seen
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.columns import finite_rows
 from geomoe3d.runtime.files import file_hash
@@ -72,8 +73,11 @@ def _laser_pieces(path: Path, size: int) -> Iterator[Piece]:
 
 def _scan_pieces(path: Path, size: int) -> Iterator[Piece]:
     for scan in read_scans(path):
-        for start in range(0, len(scan.points), size):
-            yield scan.points[start : start + size], scan.sensor
+        points, sensor = scan.points[finite_rows(scan.points)], scan.sensor
+        if sensor is not None and not (len(points) and may_have_seen(points, sensor)):
+            sensor = None
+        for start in range(0, len(points), size):
+            yield points[start : start + size], sensor
 
 
 def _ply_pieces(path: Path, size: int) -> Iterator[Piece] | None:

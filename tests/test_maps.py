@@ -16,11 +16,12 @@ from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.config import expert, load_config
+from geomoe3d.decision.confidence import Judgement
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
 from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.maps import store
+from geomoe3d.maps import locate, store
 from geomoe3d.maps.finding import Finder
-from geomoe3d.maps.locate import Search
+from geomoe3d.maps.locate import ANOTHER_STANDS, Search
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.places import Query
 
@@ -108,6 +109,19 @@ def test_a_copy_of_the_answers_place_is_found_though_no_window_of_the_scan_shows
     assert found.places[1].relative_score > 0.8
     monkeypatch.setattr(Search, "twins", lambda self, T, count: [])
     assert made.locate(scan[0]).ok  # what it would be without
+
+
+def test_where_another_place_would_be_ok_by_itself_none_is(rooms, scan, monkeypatch):
+    """Copies that were scanned anew have few votes, and score less: the scanner saw more of one than of another."""
+    made = Map.from_cloud(
+        np.concatenate([scanned(rooms[0], UTM + k * AWAY, 10 + k) for k in range(3)]), voxel_size=GRID
+    )
+    assert made.locate(scan[0]).status == "ambiguous"
+
+    monkeypatch.setattr(locate, "judge", lambda *_: Judgement("ok", (), 0.99))  # whatever the scores say
+    found = made.locate(scan[0])
+    assert found.status == "ambiguous"
+    assert ANOTHER_STANDS in found.result.reasons
 
 
 def test_where_one_place_fits_plainly_only_windows_of_rivals_are_looked_into(house, scan, monkeypatch):

@@ -20,7 +20,7 @@ from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision
-from geomoe3d.decision.confidence import judge, lead_over
+from geomoe3d.decision.confidence import Judgement, judge, lead_over
 from geomoe3d.decision.scale import measure_scale
 from geomoe3d.decision.selection import Selection
 from geomoe3d.decision.shared_surface import SharedSurface
@@ -32,6 +32,10 @@ from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+
+ANOTHER_STANDS = (
+    "at another place the scan would be ok too, were it not for this one: rooms may be copies of each other"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,16 +169,14 @@ class Search:
         voters = part.features[:: math.ceil(len(near) / known.twin_voters)]
         windows = self._query.windows(4 * count, voters=voters)
         query = Query(part, level, seed=self.config.seed)
-        least = known.close * self._quick(T)
+        least, place = known.close * self._quick(T), Hypothesis(T)
         found: list[tuple[float, Hypothesis]] = []
-        for window in windows:
-            away = float(np.linalg.norm(window.center - center)) / self.reach
-            shares_points = away < known.twin_apart
-            if away < 1 or window.votes < known.twin_votes[shares_points] * windows[0].votes:
-                continue
-            moved = [h.T_target_source @ T for h in query.motions(window, 3)]
+        for window in _likest(windows, center, self.reach):
+            moved = [Hypothesis(h.T_target_source @ T) for h in query.motions(window, 3)]
+            # Windows that reach the place hold its own points, too.
+            moved = [h for h in moved if self.differ(place, h)]
             if moved:
-                twin = self._polished(max(moved, key=self._quick))
+                twin = self._polished(moved[0].T_target_source)
                 found.append((self._quick(twin, least), Hypothesis(twin)))
         found = [(score, h) for score, h in found if score > least]
         distinct: list[Hypothesis] = []
@@ -268,6 +270,12 @@ class Search:
         sure = judgement.status == "ok" and best.decision.judgement.status == "ok"
         if judgement.status == "ok":  # never where it was not sure before it had rivals
             judgement = best.decision.judgement
+        if judgement.status == "ok" and any(f.stood and self.differ(answer, own) for f, own in answers[1:]):
+            # Which of the two the map's scanner saw more of says nothing of where the scan lies.
+            reasons = (ANOTHER_STANDS, *judgement.reasons)
+            most = expert().confidence.most_doubted
+            judgement = Judgement("ambiguous", reasons, min(judgement.confidence, most))
+            sure = False
         decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
         if answer.note is not None:
             decision = decision.with_note(answer.note)
@@ -351,6 +359,18 @@ class Search:
         part = replace(self._part, viewpoint=None if self.scan.viewpoint is None else eye)
         self._clock("features")
         return level.seen_from(eye, rows, part, self._line.descriptor, fully)
+
+
+def _likest(windows: Sequence[Window], center: FloatArray, reach: float) -> list[Window]:
+    """Of windows, most votes first, those that are likest to what lies within ``reach`` of a place (3,), which is none
+    of them: some that share points with it, whose votes are its own in part, and some that do not."""
+    known = expert().locating
+    away = [float(np.linalg.norm(window.center - center)) / reach for window in windows]
+    chosen: list[Window] = []
+    for low, high in ((1.0, known.twin_apart), (known.twin_apart, np.inf)):
+        some = [w for w, d in zip(windows, away, strict=True) if low <= d < high]
+        chosen += [w for w in some if w.votes >= known.twin_votes * some[0].votes][: known.twin_windows]
+    return chosen
 
 
 def _score(candidate: tuple[float, Hypothesis]) -> float:

@@ -160,7 +160,7 @@ class LocatingExpert(Section):
         "of the votes of a window with such a transform, from which another may hold one",
         "the windows of ten rooms that are one had 0.8 to 1 of the votes of the best",
     )
-    twin_votes: float = constant(
+    twin_share: float = constant(
         0.6,
         "share",
         (0, 1),

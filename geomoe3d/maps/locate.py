@@ -369,7 +369,7 @@ def _likest(windows: Sequence[Window], center: FloatArray, reach: float) -> list
     chosen: list[Window] = []
     for low, high in ((1.0, known.twin_apart), (known.twin_apart, np.inf)):
         some = [w for w, d in zip(windows, away, strict=True) if low <= d < high]
-        chosen += [w for w in some if w.votes >= known.twin_votes * some[0].votes][: known.twin_windows]
+        chosen += [w for w in some if w.votes >= known.twin_share * some[0].votes][: known.twin_windows]
     return chosen
 
 

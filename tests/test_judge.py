@@ -341,3 +341,10 @@ def test_the_formula_of_the_margin_in_the_docs_has_its_coefficients() -> None:
         [fit.offset, fit.evidence, fit.margin], abs=0.00501
     )
     assert f"between {fit.least_margin} and {fit.most_margin:g}" in " ".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "said"), [(0.918, 0.95, "0.92"), (0.9496, 0.95, "0.94"), (0.9599, 0.96, "0.95")]
+)
+def test_a_confidence_is_said_as_on_top_and_never_as_a_limit_that_it_misses(value, limit, said):
+    assert confidence._said_below(value, limit) == said

@@ -104,16 +104,17 @@ def judge(
         return Judgement("low_confidence", (few, *notes), min(confidence, limits.most_doubted))
     if confidence < config.min_confidence:
         low = (
-            f"confidence {_rounded_down(confidence)} is below {config.min_confidence:.2f}: the scans may not overlap, "
-            "or share too little distinctive surface"
+            f"confidence {_said_below(confidence, config.min_confidence)} is below {config.min_confidence:.2f}: "
+            "the scans may not overlap, or share too little distinctive surface"
         )
         return Judgement("low_confidence", (*notes, low), confidence, low)
     return Judgement("ok", tuple(notes), confidence)
 
 
-def _rounded_down(confidence: float) -> str:
-    """Two digits that never reach a limit which the number is below."""
-    return f"{np.floor(100 * confidence) / 100:.2f}"
+def _said_below(confidence: float, limit: float) -> str:
+    """Two digits as everywhere else, but never those of a limit which the number is below."""
+    said = f"{confidence:.2f}"
+    return said if float(said) < limit else f"{np.floor(100 * confidence) / 100:.2f}"
 
 
 def _rival_note(

@@ -136,6 +136,7 @@ def summary(model: SceneModel) -> str:
         )
         if group.bent:
             lines.append(click.style(f"    {group.bent}", fg="yellow"))
+    lines += [f"  {name} may be wrong: {reason}" for name, reason in model.doubted.items()]
     if model.unplaced:
         lines.append("not placed:")
     shown = list(model.unplaced.items())[:20]

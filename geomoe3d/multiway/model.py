@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from geomoe3d.batch.folder import foreign, has_mark, transform_name
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.decision.answer import library_versions
+from geomoe3d.decision.scale import DIFFERS
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.edges import Edge
@@ -50,7 +52,7 @@ class EdgeReport:
         source, target: names of the scans.
         fate: ``kept``: it holds the model together; ``near``: it says about what the poses say; ``rejected``:
             it contradicts them or is not sure enough; ``between groups``: it would join two groups.
-        reason: why it is not kept.
+        reason: why it is not kept; of one that is kept, what its registration says of another scale.
         confidence: of the registration.
         belief: probability that it is right, in the company of the other pairs.
         shift: root mean square distance by which it moves the source elsewhere than the final poses do, cloud
@@ -146,8 +148,20 @@ class SceneModel:
 
     @property
     def ok(self) -> bool:
-        """True where all scans stand in one group."""
-        return len(self.groups) == 1 and not self.unplaced
+        """True where all scans stand in one group, and none is `doubted`."""
+        return len(self.groups) == 1 and not self.unplaced and not self.doubted
+
+    @cached_property
+    def doubted(self) -> dict[str, str]:
+        """Name of a scan that is placed -> why it may be wrong there: most of the pairs that hold it, two at least, say
+        that its scale differs."""
+        found = {}
+        for scan in self.scans:
+            mine = [e for e in self.edges if e.kept and scan.name in (e.source, e.target)]
+            say = [e.reason for e in mine if e.reason.startswith(DIFFERS)]
+            if len(say) > max(1, len(mine) / 2):
+                found[scan.name] = f"{len(say)} of the {len(mine)} pairs that hold it say so: {say[0]}"
+        return found
 
     def to_json(self) -> str:
         """Everything but the points, in JSON; matrices by rows, every digit."""

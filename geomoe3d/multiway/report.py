@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.decision.scale import DIFFERS
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.multiway.edges import Edge, agrees, differences, expected_error, predicted_motion
 from geomoe3d.multiway.loops import find_loops
@@ -14,7 +15,7 @@ from geomoe3d.multiway.model import EdgeReport, LoopReport, SceneGroup, SceneMod
 from geomoe3d.multiway.pose_graph import spanning_tree
 from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import is_kept
-from geomoe3d.multiway.survey import Survey
+from geomoe3d.multiway.survey import Survey, key_of
 from geomoe3d.runtime.words import counted
 
 
@@ -76,6 +77,9 @@ def _report(survey: Survey, edge: Edge, home: dict[int, Group], tree: set[int]) 
                 reason = f"what its two scans share holds them too loosely: the sensor may be {error:.2g} off"
         elif not near:
             reason = f"it contradicts the poses that the other pairs give by {shift:.3g} and {turn:.1f} deg"
+    told = None if edge.of_maps else survey.outcomes.get(key_of(edge.source, edge.target))
+    if fate == "kept" and told is not None and told.result is not None:
+        reason = next((said for said in told.result.reasons if said.startswith(DIFFERS)), "")
     if fate == "rejected" and edge.worth <= rules.least_worth:
         doubt = f"confidence {edge.confidence:.2f} is too low"
         if edge.prior > rules.least_worth:

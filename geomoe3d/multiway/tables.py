@@ -28,7 +28,8 @@ def scans_text(model: SceneModel) -> str:
         number, T = home.get(scan.name, ("", None))
         place = ["", "", ""] if T is None else [f"{value:.17g}" for value in T[:3, 3]]
         worst = f"{max(shifts):.4g}" if shifts else ""
-        reason = model.unplaced.get(scan.name, "" if mine else "held loosely: no single pair is kept")
+        loose = "" if mine else "held loosely: no single pair is kept"
+        reason = model.unplaced.get(scan.name, model.doubted.get(scan.name, loose))
         rows.append([scan.name, number, *place, len(mine), worst, reason, scan.path])
     return csv_text(_SCANS, rows)
 

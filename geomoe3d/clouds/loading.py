@@ -47,7 +47,6 @@ from geomoe3d.errors import (
 )
 from geomoe3d.geometry.columns import finite_rows
 from geomoe3d.runtime.home import ensure_home
-from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray, PointCloud
 
 READABLE_SUFFIXES = tuple(READERS)
@@ -252,9 +251,7 @@ def finite_part(raw: RawCloud, what: str) -> tuple[RawCloud, int]:
     finite = finite_rows(raw.points)
     num_non_finite = num_points - int(np.count_nonzero(finite))
     if num_non_finite == num_points:
-        raise NonFiniteError(
-            f"{what}: {counted(num_points, 'point')}, none without a NaN or infinite coordinate"
-        )
+        raise NonFiniteError(f"{what}: all {num_points} points have a NaN or infinite coordinate")
     if num_non_finite:
         raw = raw.take(finite) if raw.faces is None else meshes.without_vertices(raw, finite)
     largest = max(float(raw.points.max()), -float(raw.points.min()))

@@ -27,7 +27,7 @@ from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
-from geomoe3d.decision.scale import Scale, measure_scale
+from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
 from geomoe3d.decision.selection import Selection
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
@@ -307,15 +307,18 @@ class Line:
 
     def _in_map(self, clouds: tuple[PointCloud, PointCloud], guess: FloatArray | None) -> Explanation:
         """The first cloud sought in the second, much larger one."""
-        from geomoe3d.maps.map import nowhere, search_larger
+        from geomoe3d.maps.larger import search_larger
+        from geomoe3d.maps.location import nowhere
 
         found = search_larger(*clouds, self.pipeline, guess, self.clock)
         if found is None or found.decision.answer is None:
             reason = nowhere(*(cloud.name for cloud in clouds))
             return Explanation(failed_result(clouds, reason, self.config, self.clock.stop()), *clouds)
         decision = found.decision
-        # A map that shows little more than the scan does in its unit says nothing plain of that; the pair does.
-        if decision.judgement.status != "ok" and (units := self._units(clouds)) is not None:
+        judgement = decision.judgement
+        named = any(reason.startswith(UNITS_DIFFER) for reason in judgement.reasons)
+        # Where the larger cloud is one in another unit, not a map, its quick looks say nothing plain; the pair does.
+        if judgement.status != "ok" and not named and (units := self._units(clouds)) is not None:
             decision = decision.with_note(units, first=True)
         for remark in clouds[1].notes:
             decision = decision.with_note(remark)

@@ -13,8 +13,6 @@ import geomoe3d
 from geomoe3d import Map
 from geomoe3d.cli.errors import ExitCode, run
 from geomoe3d.cli.main import geomoe3d as program
-from geomoe3d.clouds.formats.e57 import write_scans
-from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.config import expert, load_config
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.errors import EmptyCloudError, FormatError, InputError, MissingFileError, OutputError
@@ -22,7 +20,6 @@ from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps import locate, store
 from geomoe3d.maps.finding import Finder
 from geomoe3d.maps.locate import ANOTHER_STANDS, Search
-from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.places import Query
 
 UTM = np.array([583394.0, 5283100.0, 498.0])
@@ -427,38 +424,6 @@ def test_a_sequence_goes_on_after_a_scan_that_cannot_be_read(house, scan, tmp_pa
     assert len(pose) == 1
     assert pose[0][0] == "0"
     assert "# 1 b: unusable" in lines
-
-
-def test_a_laz_is_read_in_pieces(tmp_path):
-    pytest.importorskip("laspy")
-    points = np.random.default_rng(6).uniform(0, 10, (2500, 3)) + UTM
-    geomoe3d.save_points(tmp_path / "cloud.laz", points)
-    read = [part for part, sensor in pieces(tmp_path / "cloud.laz", 1000).points()]
-    assert [len(part) for part in read] == [1000, 1000, 500]
-    np.testing.assert_array_equal(
-        np.concatenate(read), geomoe3d.load_points(tmp_path / "cloud.laz").file_points
-    )
-
-
-def test_of_an_e57_each_scan_is_read_with_its_sensor(tmp_path):
-    pytest.importorskip("pye57")
-    rng, stands = np.random.default_rng(6), np.array([[0.0, 0.0, 1.5], [4.0, 1.0, 1.6]])
-    seen = [rng.uniform(0, 5, (1500, 3)) * (1, 1, 0.0), rng.uniform(0, 5, (700, 3)) * (1, 0.0, 1)]
-    poses = [make_transform(np.eye(3), UTM + stand) for stand in stands]
-    scans = [
-        (f"scan {k}", RawCloud(part - stand), pose)
-        for k, (part, stand, pose) in enumerate(zip(seen, stands, poses, strict=True))
-    ]
-    write_scans(tmp_path / "house.e57", scans)
-    read = list(pieces(tmp_path / "house.e57", 1000).points())
-    assert [len(part) for part, _ in read] == [1000, 500, 700]
-    for (_, sensor), stand in zip(read, stands[[0, 0, 1]], strict=True):
-        np.testing.assert_allclose(sensor, UTM + stand)
-    np.testing.assert_allclose(np.concatenate([p for p, _ in read]), np.concatenate(seen) + UTM, atol=1e-6)
-    voxels = Map.empty(voxel_size=0.3).with_cloud(tmp_path / "house.e57")._voxels
-    floor = voxels.points + voxels.origin - UTM
-    floor, towards = floor[:, 2] < 0.05, voxels.towards
-    assert (towards[floor, 2] > 0).mean() > 0.9  # the first sensor stood above it
 
 
 # ---- register ------------------------------------------------------------------------------------------

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+import geomoe3d
+from geomoe3d import Map
 from geomoe3d.clouds.formats.e57 import write_scans
 from geomoe3d.clouds.formats.raw import RawCloud
 from geomoe3d.clouds.formats.registry import READERS
@@ -13,6 +15,8 @@ from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps.pieces import pieces
+
+UTM = np.array([583394.0, 5283100.0, 498.0])
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -72,3 +76,35 @@ def test_a_pose_far_from_its_points_is_a_georeference_and_no_sensor(tmp_path, fa
     ((read, sensor),) = pieces(tmp_path / "merged.e57", 1000).points()
     np.testing.assert_allclose(read, points, atol=1e-6)
     assert (sensor is not None) == believed
+
+
+def test_a_laz_is_read_in_pieces(tmp_path):
+    pytest.importorskip("laspy")
+    points = np.random.default_rng(6).uniform(0, 10, (2500, 3)) + UTM
+    geomoe3d.save_points(tmp_path / "cloud.laz", points)
+    read = [part for part, sensor in pieces(tmp_path / "cloud.laz", 1000).points()]
+    assert [len(part) for part in read] == [1000, 1000, 500]
+    np.testing.assert_array_equal(
+        np.concatenate(read), geomoe3d.load_points(tmp_path / "cloud.laz").file_points
+    )
+
+
+def test_of_an_e57_each_scan_is_read_with_its_sensor(tmp_path):
+    pytest.importorskip("pye57")
+    rng, stands = np.random.default_rng(6), np.array([[0.0, 0.0, 1.5], [4.0, 1.0, 1.6]])
+    seen = [rng.uniform(0, 5, (1500, 3)) * (1, 1, 0.0), rng.uniform(0, 5, (700, 3)) * (1, 0.0, 1)]
+    poses = [make_transform(np.eye(3), UTM + stand) for stand in stands]
+    scans = [
+        (f"scan {k}", RawCloud(part - stand), pose)
+        for k, (part, stand, pose) in enumerate(zip(seen, stands, poses, strict=True))
+    ]
+    write_scans(tmp_path / "house.e57", scans)
+    read = list(pieces(tmp_path / "house.e57", 1000).points())
+    assert [len(part) for part, _ in read] == [1000, 500, 700]
+    for (_, sensor), stand in zip(read, stands[[0, 0, 1]], strict=True):
+        np.testing.assert_allclose(sensor, UTM + stand)
+    np.testing.assert_allclose(np.concatenate([p for p, _ in read]), np.concatenate(seen) + UTM, atol=1e-6)
+    voxels = Map.empty(voxel_size=0.3).with_cloud(tmp_path / "house.e57")._voxels
+    floor = voxels.points + voxels.origin - UTM
+    floor, towards = floor[:, 2] < 0.05, voxels.towards
+    assert (towards[floor, 2] > 0).mean() > 0.9  # the first sensor stood above it

@@ -20,6 +20,7 @@ from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import FloatArray
 
 DIFFERS = "the scale differs"
+UNITS_DIFFER = "units differ"
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "metres": 1.0}
 
 
@@ -144,8 +145,8 @@ def units_differ(ratio: float, source: str, target: str) -> str:
     """A sentence for two clouds, by name, that fit once all lengths of the first are divided by a ratio."""
     units = seeming_units(ratio, (f"'{source}'", f"'{target}'"))
     return (
-        f"units differ: with all lengths of '{source}' divided by {ratio:.6g} the clouds fit{units}; bring both to one "
-        "unit, a rigid transform cannot change scale"
+        f"{UNITS_DIFFER}: with all lengths of '{source}' divided by {ratio:.6g} the clouds fit{units}; bring both to "
+        "one unit, a rigid transform cannot change scale"
     )
 
 

@@ -61,3 +61,8 @@ class Location:
             for place in self.places
         ]
         return json.dumps(told, indent=indent, allow_nan=False)
+
+
+def nowhere(scan: str, world: str) -> str:
+    """The reason of an answer without any candidate."""
+    return f"no place was found in '{world}' at which '{scan}' could lie"

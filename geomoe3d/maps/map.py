@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +25,7 @@ from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
 from geomoe3d.maps.finding import Finder
 from geomoe3d.maps.level import Level
 from geomoe3d.maps.locate import Found
-from geomoe3d.maps.location import Location, Place
+from geomoe3d.maps.location import Location, Place, nowhere
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.store import Source, load, save
 from geomoe3d.maps.voxels import VoxelSums
@@ -348,11 +347,6 @@ class Map:
         return Location(failed_result((cloud, target), reason, self.config, clock.stop()), ())
 
 
-def nowhere(scan: str, world: str) -> str:
-    """The reason of an answer without any candidate."""
-    return f"no place was found in '{world}' at which '{scan}' could lie"
-
-
 def _size(level: Level) -> float:
     return level.voxel_size
 
@@ -391,27 +385,3 @@ def _near(near: ArrayLike | None, within: float | None, k: int) -> tuple[FloatAr
     if not (math.isfinite(within) and within > 0):
         raise InputError(f"within is {within}, expected a positive length")
     return place, float(within)
-
-
-def search_larger(
-    scan: PointCloud, world: PointCloud, line: Pipeline, guess: FloatArray | None, clock: StageClock
-) -> Found | None:
-    """One cloud sought in a much larger one: what `geomoe3d.line` does with such a pair.
-
-    Args:
-        scan: the smaller cloud, as loaded.
-        world: the larger one, as loaded; its sensor is not asked for.
-        line: parts of the configuration.
-        guess: (4, 4) of T_world_scan, file coordinates, or None.
-        clock: told of the stages.
-
-    Returns:
-        The scan and the part of the larger cloud around the answer, in the clouds' local coordinates, and what was
-        decided; None where there was no candidate.
-    """
-    clock("index")
-    nothing = VoxelSums.empty(1.0, np.zeros(3))
-    made = Map(nothing, config=line.config, line=line).with_cloud(replace(world, sensor=None))
-    guesses = [] if guess is None else [guess]
-    found = made._finder(scan, scan, guesses, None, expert().maps.candidates, clock)[0]
-    return None if found is None else replace(found, decision=made._told(found, scan, clock))

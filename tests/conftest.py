@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     import numpy as np
     from command_line import FakeRegistrar
 
+    from geomoe3d import Map
+    from geomoe3d.data.rooms.solids import Solids
     from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 
 # What these assert for several files explains itself as in a test.
@@ -112,3 +114,37 @@ def own_cache(tmp_path_factory):
         del os.environ["GEOMOE3D_CACHE"]
     else:
         os.environ["GEOMOE3D_CACHE"] = kept
+
+
+@pytest.fixture(scope="module")
+def rooms() -> tuple[Solids, Solids]:
+    """Two rooms that have nothing in common."""
+    from generated_buildings import first_room, other_room
+
+    return first_room(), other_room(3)
+
+
+@pytest.fixture(scope="module")
+def building(rooms: tuple[Solids, Solids]) -> np.ndarray:
+    """Both side by side, as one cloud."""
+    from generated_buildings import two_rooms
+
+    return two_rooms(rooms)
+
+
+@pytest.fixture(scope="module")
+def house(building: np.ndarray) -> Map:
+    """A map of them."""
+    from generated_buildings import GRID
+
+    from geomoe3d import Map
+
+    return Map.from_cloud(building, voxel_size=GRID)
+
+
+@pytest.fixture(scope="module")
+def scan(rooms: tuple[Solids, Solids]) -> tuple[np.ndarray, np.ndarray]:
+    """A view of the first room, and its true pose."""
+    from generated_buildings import UTM, view
+
+    return view(rooms[0], UTM, 5)

@@ -33,7 +33,7 @@ def test_a_binary_ply_of_points_is_read_in_pieces(tmp_path, order):
     lines += [*(f"property {name} {axis}" for name, axis in types), "element face 0", "end_header"]
     path = tmp_path / "scan.ply"
     path.write_bytes("\n".join(lines).encode() + b"\n" + rows.tobytes())
-    read = list(pieces(path, 1000).points())
+    read = list(pieces(path, 1000).points)
     assert [len(points) for points, _ in read] == [999, 1000, 500]
     expected = load_points(path).file_points
     np.testing.assert_array_equal(np.vstack([points for points, _ in read]), expected)
@@ -52,7 +52,7 @@ def test_a_ply_with_faces_or_in_text_is_read_at_once_as_elsewhere(tmp_path):
     mesh = trimesh.Trimesh(corners, np.arange(60).reshape(20, 3), process=False)
     mesh.export(tmp_path / "mesh.ply")
     for path in (text, tmp_path / "mesh.ply"):
-        ((points, _),) = pieces(path, 10**6).points()
+        ((points, _),) = pieces(path, 10**6).points
         np.testing.assert_allclose(points, load_points(path).file_points, atol=1e-9)
 
 
@@ -61,7 +61,7 @@ def test_a_reader_of_the_users_own_is_asked_for_a_map_too(tmp_path, monkeypatch,
     points = np.random.default_rng(0).uniform(size=(60, 3))
     save_points(tmp_path / f"scan{suffix}", points)
     monkeypatch.setitem(READERS, suffix, lambda path: points + 100.0)
-    ((read, _),) = pieces(tmp_path / f"scan{suffix}", 1000).points()
+    ((read, _),) = pieces(tmp_path / f"scan{suffix}", 1000).points
     np.testing.assert_allclose(read, points + 100.0, atol=1e-9)
 
 
@@ -73,7 +73,7 @@ def test_a_pose_far_from_its_points_is_a_georeference_and_no_sensor(tmp_path, fa
     write_scans(
         tmp_path / "merged.e57", [("merged", RawCloud(points - place), make_transform(np.eye(3), place))]
     )
-    ((read, sensor),) = pieces(tmp_path / "merged.e57", 1000).points()
+    ((read, sensor),) = pieces(tmp_path / "merged.e57", 1000).points
     np.testing.assert_allclose(read, points, atol=1e-6)
     assert (sensor is not None) == believed
 
@@ -82,7 +82,7 @@ def test_a_laz_is_read_in_pieces(tmp_path):
     pytest.importorskip("laspy")
     points = np.random.default_rng(6).uniform(0, 10, (2500, 3)) + UTM
     geomoe3d.save_points(tmp_path / "cloud.laz", points)
-    read = [part for part, sensor in pieces(tmp_path / "cloud.laz", 1000).points()]
+    read = [part for part, sensor in pieces(tmp_path / "cloud.laz", 1000).points]
     assert [len(part) for part in read] == [1000, 1000, 500]
     np.testing.assert_array_equal(
         np.concatenate(read), geomoe3d.load_points(tmp_path / "cloud.laz").file_points
@@ -99,7 +99,7 @@ def test_of_an_e57_each_scan_is_read_with_its_sensor(tmp_path):
         for k, (part, stand, pose) in enumerate(zip(seen, stands, poses, strict=True))
     ]
     write_scans(tmp_path / "house.e57", scans)
-    read = list(pieces(tmp_path / "house.e57", 1000).points())
+    read = list(pieces(tmp_path / "house.e57", 1000).points)
     assert [len(part) for part, _ in read] == [1000, 500, 700]
     for (_, sensor), stand in zip(read, stands[[0, 0, 1]], strict=True):
         np.testing.assert_allclose(sensor, UTM + stand)

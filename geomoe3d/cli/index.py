@@ -37,7 +37,8 @@ def command(
     """Prepare CLOUDS (files, or folders of them) as one map, the file OUT.map.
 
     `geomoe3d locate` finds scans in it. Called again with more clouds, or after an interruption, it reads only those
-    that are not in it yet. LAS, LAZ, binary PLY and E57 are read in pieces. With --poses each cloud is one scan in
+    that are not in it yet. Where one has changed, or has another pose, all are read anew if all are given, else it
+    is an error. LAS, LAZ, binary PLY and E57 are read in pieces. With --poses each cloud is one scan in
     coordinates of its own.
     """
     if len(inputs) < 2:
@@ -52,7 +53,7 @@ def command(
         from geomoe3d.clouds.viewpoint import find_viewpoints
         from geomoe3d.errors import OutputError
         from geomoe3d.maps.map import Map
-        from geomoe3d.maps.store import looks_like_map
+        from geomoe3d.maps.store import StaleMapError, looks_like_map
         from geomoe3d.multiway.initial import read_poses
         from geomoe3d.multiway.scans import find_clouds
         from geomoe3d.runtime.files import check_output
@@ -63,23 +64,48 @@ def command(
         scans = find_clouds(inputs[:-1])
         where = None if poses is None else read_poses(poses, [scan.name for scan in scans])
         made = Map.open(out, config=config) if out.exists() and not fresh else Map.empty(config=config)
-        before, kept = made.sources, time.monotonic()
-        for number, scan in enumerate(scans):
-            stage(f"read {Path(scan.path).name}")
-            if where is None:
-                made = made.with_cloud(scan.path)
-            else:
-                cloud = load_points(scan.path)
-                view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
-                sensor = None if view is None else view + cloud.origin
-                made = made.with_cloud(scan.path, T_map_cloud=where[number], sensor=sensor)
-            # A minute after the last time, what was read so far is written.
-            if time.monotonic() - kept > 60.0:
-                made.save(out, force=True)
-                kept = time.monotonic()
+
+        def with_all(made: Map) -> Map:
+            kept = time.monotonic()
+            for number, scan in enumerate(scans):
+                stage(f"read {Path(scan.path).name}")
+                if where is None:
+                    made = made.with_cloud(scan.path)
+                else:
+                    cloud = load_points(scan.path)
+                    view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
+                    sensor = None if view is None else view + cloud.origin
+                    made = made.with_cloud(scan.path, T_map_cloud=where[number], sensor=sensor)
+                # A minute after the last time, what was read so far is written.
+                if time.monotonic() - kept > 60.0:
+                    made.save(out, force=True)
+                    kept = time.monotonic()
+            return made
+
+        before, anew = made.sources, ""
+        try:
+            made = with_all(made)
+        except StaleMapError as error:
+            # What was given makes all of the map: nothing is lost where it begins anew, but for poses.
+            posed = where is None and any(source.T_map_cloud for source in before)
+            if posed or not {source.path for source in before} <= {
+                str(Path(scan.path).resolve()) for scan in scans
+            }:
+                raise
+            before, anew = (), f"{str(error).split(';')[0]}: all clouds were read anew"
+            made = with_all(Map.empty(config=config))
+        doubles = sorted({s.name for s in before} & {s.name for s in made.sources[len(before) :]})
         made.describe(progress=stage)
         stage("write")
         made.save(out, force=True)
+    if anew:
+        click.echo(anew, err=True)
+    for name in doubles:
+        click.echo(
+            f"warning: the map held another '{name}' already, of another folder or other content; both are in it now, "
+            "begin anew with --fresh if that was the same scan",
+            err=True,
+        )
     if not quiet:
         added = len(made.sources) - len(before)
         sizes = ", ".join(f"{size:.4g}" for size in made.voxel_sizes)

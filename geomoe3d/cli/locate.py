@@ -35,7 +35,12 @@ Form = Literal["text", "json", "quiet"]
     show_default=True,
     help="Most candidate places to list.",
 )
-@click.option("--near", metavar="X,Y,Z", help="Roughly where the scanner stood, in the map's coordinates.")
+@click.option(
+    "--near",
+    metavar="X,Y,Z",
+    help="Roughly where the scanner stood, in the map's coordinates; of a scan that does not show where that was (give "
+    "--sensor) where its middle lies.",
+)
 @click.option(
     "--within", type=float, metavar="LENGTH", help="How far off --near may be, in the unit of the map."
 )

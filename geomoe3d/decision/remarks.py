@@ -12,7 +12,7 @@ import numpy as np
 from geomoe3d.clouds.voxel_size import choose_voxel_size
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.decision.confidence import Judgement
-from geomoe3d.types import PointCloud, PreparedCloud
+from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
 _NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 99999.0)  # what programs write for no measurement
 
@@ -46,14 +46,9 @@ def remarks(
     if judgement.status == "ok":
         return
     for cloud in {cloud.name: cloud for cloud in described}.values():
-        spread = np.linalg.svd(cloud.points - cloud.points.mean(0), compute_uv=False)
-        if spread[1] < expert().remarks.flat * spread[0]:
-            yield f"all points of '{cloud.name}' lie on one straight line; they fix no turn about it"
-        elif spread[2] < expert().remarks.flat * spread[0]:
-            yield (
-                f"'{cloud.name}' is flat: all its points lie in one plane, as those of a 2-D scanner do; this method "
-                "compares surfaces in space, so give scans with height"
-            )
+        flat = flatness(cloud.name, cloud.points)
+        if flat is not None:
+            yield flat
     fewest = min(described, key=len)
     if len(fewest) < expert().remarks.few_voxels:
         yield (
@@ -98,6 +93,21 @@ def _no_data(cloud: PointCloud) -> Iterator[str]:
                     f"'{cloud.name}': {count:,} points have the {name} {number:.0f}, which stands for no measurement "
                     "in many programs; remove them"
                 )
+
+
+def flatness(name: str, points: FloatArray) -> str | None:
+    """A sentence where points (N, 3), four or more, lie on one line or in one plane, else None."""
+    if len(points) <= 3:
+        return None
+    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    if spread[1] < expert().remarks.flat * spread[0]:
+        return f"all points of '{name}' lie on one straight line; they fix no turn about it"
+    if spread[2] < expert().remarks.flat * spread[0]:
+        return (
+            f"'{name}' is flat: all its points lie in one plane, as those of a 2-D scanner do; this method compares "
+            "surfaces in space, so give scans with height"
+        )
+    return None
 
 
 def _is_one_file(given: tuple[Any, Any]) -> bool:

@@ -92,8 +92,9 @@ class Level:
         points = drop_isolated(points, radius)
         if len(points) < (least := expert().maps.least_points):
             raise EmptyCloudError(
-                f"'{name}': {counted(len(points), 'point')} left on a {voxel_size:.4g} grid, at least {least} are "
-                "needed; give a denser cloud or a voxel size that fits it"
+                f"'{name}' fills only {counted(len(means), 'voxel')}, and {len(points)} of these have neighbours "
+                f"on a {voxel_size:.4g} grid, at least {least} must: too few points for a map; give a denser cloud "
+                "or a voxel size that fits it"
             )
         normals = estimate_normals(points, radius, config.normal_neighbors)
         normals, known = _turned(points, normals, voxels)

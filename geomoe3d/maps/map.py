@@ -18,6 +18,7 @@ from geomoe3d.clouds.viewpoint import with_sensor
 from geomoe3d.clouds.voxel_size import robust_extent, round_size, typical_spacing
 from geomoe3d.config import RegistrationConfig, build_config, expert, expert_in_force
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
+from geomoe3d.decision.remarks import flatness
 from geomoe3d.decision.scale import ratios_to_metres, units_differ
 from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError, InputError
@@ -143,18 +144,19 @@ class Map:
 
         Raises:
             InputError: a cloud that cannot be read or has no usable points, one that seems to be in another unit than
-                the map, or no rigid transform.
+                the map, or no rigid transform; as `StaleMapError` a file whose content is another one than when it was
+                read into the map, or a cloud that is in the map at another place.
         """
         tell = progress or (lambda stage: None)
         tell("load")
         T = np.eye(4) if T_map_cloud is None else check_motion(T_map_cloud)
         read = pieces(cloud, _PIECE)
         told = None if sensor is None else np.asarray(sensor, dtype=np.float64)
-        if any(read.sha256 == source.sha256 for source in self.sources):
+        if any(source.holds(read.sha256, read.path, T) for source in self.sources):
             return self
         voxels, count = self._voxels, 0
         corners = np.array([np.full(3, np.inf), np.full(3, -np.inf)])
-        for points, seen_from in read.points():
+        for points, seen_from in read.points:
             eye = seen_from if told is None else told
             place = None if eye is None else transform_points(T, eye[None])[0]
             moved = points if T_map_cloud is None else transform_points(T, points)
@@ -168,7 +170,8 @@ class Map:
         if len(self._voxels):
             self._check_added(read.name, float(np.linalg.norm(corners[1] - corners[0])))
         name = self.name if self.sources else read.name
-        sources = (*self.sources, Source(read.name, read.sha256, count))
+        rows = None if T_map_cloud is None else tuple(tuple(row) for row in T.tolist())
+        sources = (*self.sources, Source(read.name, read.sha256, count, read.path, rows))
         return Map(voxels, (), sources, config=self.config, name=name, line=self._line)
 
     @expert_in_force
@@ -183,9 +186,13 @@ class Map:
 
         Raises:
             EmptyCloudError: no points, or fewer than 3 that have neighbours there.
+            InputError: all points lie in one plane or on one line.
         """
         if not len(self._voxels):
             raise EmptyCloudError("the map holds no points yet; add a cloud first: map.with_cloud(...)")
+        flat = flatness(self.name, self._voxels.points)
+        if flat is not None:
+            raise InputError(f"{flat}; no scan can be found in such a map")
         if progress is not None:
             progress("describe")
         known, wanted = expert().maps, voxel_size or self.config.voxel_size

@@ -32,13 +32,15 @@ class Pieces:
     Attributes:
         name: what to call it.
         sha256: of the file, or of the points of a cloud in memory.
-        points: gives it piece by piece.
+        points: it piece by piece, once; nothing is read before it is asked.
+        path: absolute, of its file; empty where there is none.
         origin: (3,) of the local coordinates of a cloud that was read at once, else None.
     """
 
     name: str
     sha256: str
-    points: Callable[[], Iterator[Piece]]
+    points: Iterator[Piece]
+    path: str = ""
     origin: FloatArray | None = None
 
 
@@ -52,8 +54,9 @@ def pieces(cloud: Any, size: int) -> Pieces:
     if path is not None and path.is_file():
         take_inherited()
         stream = _STREAMED.get(READERS.get(path.suffix.lower()))
-        if stream is not None and stream(path, size) is not None:
-            return Pieces(path.name, file_hash(path), lambda: _finite(path, stream(path, size) or iter(())))
+        streamed = None if stream is None else stream(path, size)
+        if streamed is not None:
+            return Pieces(path.name, file_hash(path), _finite(path, streamed), str(path.resolve()))
     loaded = load_points(cloud)
     if path is not None:
         digest = file_hash(path)
@@ -64,7 +67,7 @@ def pieces(cloud: Any, size: int) -> Pieces:
         for start in range(0, len(loaded), size):
             yield loaded.points[start : start + size] + loaded.origin, loaded.sensor
 
-    return Pieces(loaded.name, digest, parts, loaded.origin)
+    return Pieces(loaded.name, digest, parts(), "" if path is None else str(path.resolve()), loaded.origin)
 
 
 def _laser_pieces(path: Path, size: int) -> Iterator[Piece]:

@@ -19,13 +19,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import FormatError, MissingFileError, cannot_read
+from geomoe3d.errors import FormatError, InputError, MissingFileError, cannot_read
 from geomoe3d.features.learned import LearnedDescriptor
+from geomoe3d.geometry.se3 import motions_apart
 from geomoe3d.maps.level import Level
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.runtime.files import write_atomically
+from geomoe3d.types import FloatArray
 
-VERSION = 3
+VERSION = 4
+_SAME = 1e-9  # of one transform that was written and read again, in each number
 _LEVEL = tuple(field.name for field in fields(Level) if field.name not in ("voxel_size", "sensors"))
 _VOXELS = ("origin", "keys", "sums", "counts", "towards", "sensors")
 
@@ -38,11 +41,44 @@ class Source:
         name: of its file, or what the caller called it.
         sha256: of the file, or of its points.
         num_points: finite points of it in the map.
+        path: absolute, of its file when it was read; empty where there was none, or where the map was written by a
+            version that did not keep it.
+        T_map_cloud: rows of the (4, 4) by which it was brought into the map, file coordinates; None: as it was.
     """
 
     name: str
     sha256: str
     num_points: int
+    path: str = ""
+    T_map_cloud: tuple[tuple[float, ...], ...] | None = None
+
+    def holds(self, sha256: str, path: str, T: FloatArray) -> bool:
+        """Whether it is the cloud of a hash, a path and a transform (4, 4) into the map.
+
+        Raises:
+            StaleMapError: the file has another content by now, or the cloud lies elsewhere.
+        """
+        what = ""
+        if not self.path and path:
+            return self.sha256 == sha256  # a version that kept no paths kept no transforms either
+        if self.sha256 == sha256:
+            own = np.eye(4) if self.T_map_cloud is None else np.array(self.T_map_cloud)
+            if not np.allclose(own, T, rtol=_SAME, atol=_SAME):
+                shift, turn = motions_apart(own, T, np.zeros(3))
+                off = f"{shift:.3g} and {turn:.3g} deg from where it is put now"
+                what = f"is in the map already, {off}; give the pose it had, or"
+        elif path and self.path == path:
+            what = "has changed since it was read into the map;"
+        if what:
+            raise StaleMapError(
+                f"'{self.name}' {what} index all clouds of the map again (--fresh in the shell), since nothing can be "
+                "taken out of a map"
+            )
+        return self.sha256 == sha256
+
+
+class StaleMapError(InputError):
+    """A cloud of a map has changed, or lies elsewhere."""
 
 
 def save(

@@ -1,4 +1,4 @@
-"""What `measure_maps.py` seeks in what: recorded rooms, generated buildings, the pairs of data/world."""
+"""What `measure_maps.py` seeks in what: recorded rooms, generated buildings, meshes, the pairs of data/world."""
 
 from __future__ import annotations
 
@@ -88,15 +88,19 @@ class Scenes:
         return T
 
     def asked(self, scene: str) -> list[int]:
-        """The fragments that are asked for, evenly over the scene."""
-        numbers = self.numbers(scene)
-        return [numbers[k] for k in np.linspace(0, len(numbers) - 1, PER_SCENE).round().astype(int)]
+        """The fragments that are asked for."""
+        return self.some(scene, PER_SCENE)
 
-    def merged(self, scenes: list[str], turn: int) -> FloatArray:
+    def some(self, scene: str, count: int) -> list[int]:
+        """So many fragments, evenly over the scene."""
+        numbers = self.numbers(scene)
+        return [numbers[k] for k in np.linspace(0, len(numbers) - 1, count).round().astype(int)]
+
+    def merged(self, scenes: list[str], turn: int | None = None) -> FloatArray:
         """(N, 3) of some scenes without what is asked for in a turn."""
         parts = []
         for scene in scenes:
-            out = self.asked(scene)[turn::TURNS]
+            out = [] if turn is None else self.asked(scene)[turn::TURNS]
             parts += [
                 transform_points(self.pose(scene, number), self.points(scene, number))
                 for number in self.numbers(scene)
@@ -126,12 +130,12 @@ def _poses(scene: str) -> dict[int, FloatArray]:
 
 
 class Building:
-    """Generated rooms in a raster; the first ten are one room where they are to be alike."""
+    """Generated rooms in a raster, of seeds from one on; the first ten are one room where they are to be alike."""
 
-    def __init__(self, alike: bool) -> None:
-        self._seeds = [0 if alike and k < ALIKE else k for k in range(ROOMS)]
+    def __init__(self, alike: bool = False, *, begin: int = 0, count: int = ROOMS) -> None:
+        self._seeds = [begin if alike and k < ALIKE else begin + k for k in range(count)]
         self.asked = (
-            [(k % ALIKE, k // ALIKE) for k in range(2 * ALIKE)] if alike else [(k, 0) for k in range(ROOMS)]
+            [(k % ALIKE, k // ALIKE) for k in range(2 * ALIKE)] if alike else [(k, 0) for k in range(count)]
         )
         self._scenes = {seed: _one_room(seed) for seed in sorted(set(self._seeds))}
 
@@ -198,8 +202,10 @@ def _one_room(seed: int) -> Scene:
 
 def tasks(cases: list[str]) -> Iterator[Task]:
     """The maps of some cases."""
-    if set(cases) & {"room", "three", "stranger", "feet"}:
+    if set(cases) & {"room", "three", "feet"}:
         yield from _of_rooms(Scenes(), cases)
+    if "stranger" in cases:
+        yield from _of_strangers(Scenes())
     for case in ("building", "alike", "large"):
         if case in cases:
             made = Building(case == "alike")
@@ -215,12 +221,7 @@ def tasks(cases: list[str]) -> Iterator[Task]:
 def _of_rooms(scenes: Scenes, cases: list[str]) -> Iterator[Task]:
     rooms = scenes.names[:3]
 
-    def query(case: str, scene: str, number: int, *, there: bool = True, times: float = 1.0) -> Query:
-        def load() -> Scan:
-            return times * scenes.points(scene, number), scenes.pose(scene, number) if there else None
-
-        return Query(f"{case}/{scene}/{number}", load)
-
+    query = partial(_fragment, scenes)
     for turn in range(TURNS):
         asked = {scene: scenes.asked(scene)[turn::TURNS] for scene in rooms}
         world = cache(partial(scenes.merged, rooms, turn))
@@ -231,10 +232,6 @@ def _of_rooms(scenes: Scenes, cases: list[str]) -> Iterator[Task]:
                 yield Task("room", partial(scenes.merged, [scene], turn), alone)
         if "three" in cases:
             yield Task("three", world, [query("three", *of) for of in every])
-        if "stranger" in cases:
-            other = scenes.names[3]
-            strangers = scenes.numbers(other)[turn::TURNS]
-            yield Task("stranger", world, [query("stranger", other, n, there=False) for n in strangers])
         if "feet" in cases:
             both = [
                 query(f"feet{name}", *of, there=False, times=times)
@@ -242,6 +239,45 @@ def _of_rooms(scenes: Scenes, cases: list[str]) -> Iterator[Task]:
                 for name, times in (("", FEET), (" back", 1 / FEET))
             ]
             yield Task("feet", world, both)
+
+
+def _of_strangers(scenes: Scenes) -> Iterator[Task]:
+    """Scans of scenes that are not in the map: in one room, in three, in 40 generated ones, in scanned meshes."""
+
+    def fragments(case: str, of: list[str], count: int) -> list[Query]:
+        return [
+            _fragment(scenes, case, scene, number, there=False)
+            for scene in of
+            for number in scenes.some(scene, count)
+        ]
+
+    for scene in scenes.names:
+        others = [name for name in scenes.names if name != scene]
+        one, three = f"stranger one {scene}", f"stranger three without {scene}"
+        yield Task("stranger, one room", partial(scenes.merged, [scene]), fragments(one, others, 5))
+        yield Task("stranger, three", partial(scenes.merged, others), fragments(three, [scene], 10))
+    elsewhere = Building(begin=1000, count=12)
+
+    def view(room: int) -> Scan:
+        return elsewhere.view(room)[0], None
+
+    views = [Query(f"stranger building/{room}", partial(view, room)) for room, _ in elsewhere.asked]
+    recorded = fragments("stranger building", scenes.names, 3)
+    yield Task("stranger, building", Building().cloud, [*views, *recorded])
+    for mesh in sorted((find_benchmark_root().parent / "scenes").glob("*.ply")):
+        cloud = load_points(mesh, mesh_points=200_000).file_points
+        yield Task(
+            "stranger, mesh", partial(np.asarray, cloud), fragments(f"stranger {mesh.stem}", scenes.names, 5)
+        )
+
+
+def _fragment(
+    scenes: Scenes, case: str, scene: str, number: int, *, there: bool = True, times: float = 1.0
+) -> Query:
+    def load() -> Scan:
+        return times * scenes.points(scene, number), scenes.pose(scene, number) if there else None
+
+    return Query(f"{case}/{scene}/{number}", load)
 
 
 def _of_world(folder: Path) -> Iterator[Task]:

@@ -5,7 +5,9 @@
 
 The rooms are three dev scenes of 3DMatch, each merged by its published poses; 60 fragments are asked for, 20 of each.
 They are left out in five turns: a map holds none of the twelve fragments asked for in its turn. Side by side the rooms
-stand 12 m apart (34 m, 3 million points). Strangers are the fragments of a fourth scene, sought in the three rooms;
+stand 12 m apart (34 m, 3 million points). Strangers are scans of scenes that are not in the map, none of which may be
+ok: fragments in each other scene and in the three others, views of other generated rooms and fragments in the building,
+fragments in the meshes of data/scenes;
 `feet` are the 60 with lengths multiplied by 3.28 and by 0.3048, none of which may be ok. The building holds 40
 generated rooms in a raster, no two alike, or (`alike`) ten of them the same room; each is scanned from three places by
 a laser on a tripod. Each room, or twice each of those that are alike, is asked for by a depth camera that turns by 60
@@ -91,7 +93,8 @@ def ask(
         T: FloatArray | None = found.T_map_scan
         evidence = found.result.evidence
         line = {"status": found.status, "confidence": found.result.confidence}
-        line |= {name: evidence.get(name) for name in ("scale_ratio", "scale_sigma")}
+        line["evidence"] = dict(evidence)
+        line["voxel_size"], line["inliers"] = found.result.voxel_size, found.result.num_inliers
         line["reasons"] = found.result.reasons
         places = [place.T_map_scan for place in found.places]
     else:

@@ -289,7 +289,7 @@ def _check_register(machine: Machine) -> Finding:
     """Whether the short name means ours; another `register` is easily installed, by Tcl or an old package."""
     found, ours = machine.register_on_path(), Path(machine.executable()).parent
     if found is None or Path(found).parent == ours:
-        return Finding("register", "ok", found or "not on the PATH", required=False)
+        return Finding("register", "ok", found or "not on the PATH; use `geomoe3d register`", required=False)
     mend = f'call `geomoe3d register` instead, or put ours first: export PATH="{ours}:$PATH"'
     return Finding("register", "broken", f"{found} comes first on the PATH", mend, required=False)
 

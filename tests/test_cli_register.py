@@ -60,6 +60,11 @@ def test_summary_tells_everything_and_is_plain_where_nobody_sees_colours(scan_fi
     assert "\x1b[" in summary(fake_registrar.answer)  # the terminal's share
 
 
+def test_a_runner_up_above_the_answer_is_told_as_a_multiple():
+    result = make_result(alternative=Alternative(np.eye(4), 2.44, 92.1, 1.25))
+    assert "runner-up   2.44 times the score, differs by 92.1 deg" in summary(result)
+
+
 def test_matrix_on_screen_is_exact_enough_at_national_grid_coordinates():
     rows = [[float(cell) for cell in line.split()] for line in matrix_text(TRUTH).splitlines()]
     point = np.array([[5e6, -6e6, 1000.0]])

@@ -291,6 +291,9 @@ def test_a_value_for_a_section_names_keys_that_there_are() -> None:
         ("descriptor.options=3", "it must be pairs of name and value in braces"),
         ("estimator.name=3", "= 3: it must be text$"),
         ("preparation.max_points=1.5", "it must be a whole number$"),
+        ("preparation.max_points=true", "'true': it must be a whole number$"),
+        ("second_look.grids=[2, true]", "'second_look.grids.1' = 'true': it must be a number$"),
+        ("decision.min_confidence=null", "= null: it must be a number$"),
         ("refinement.parallel=maybe", "it must be true or false$"),
     ],
 )

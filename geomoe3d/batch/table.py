@@ -158,12 +158,12 @@ def check_rows(rows: list[PairRow], lines: list[str], what: str) -> list[PairRow
         raise InputError(f"{what} holds no pairs; give at least one row with source and target")
     seen: dict[str, str] = {}
     for row, line in zip(rows, lines, strict=True):
-        if row.id in seen:
+        name = os.path.normcase(row.id)  # ids name files, and Windows knows no capitals in their names
+        if name in seen:
             raise InputError(
-                f"{line}: the id '{row.id}' is that of {seen[row.id]} too; give every pair its own in the "
-                "column id"
+                f"{line}: the id '{row.id}' is that of {seen[name]} too; give every pair its own in the column id"
             )
-        seen[row.id] = line
+        seen[name] = line
     return rows
 
 

@@ -132,7 +132,9 @@ def _alternative(result: RegistrationResult, unit: str) -> str:
     other = result.alternative
     if other is None:
         return "none that differs clearly comes near"
+    share = other.relative_score
+    score = f"{100 * share:.0f} % of the score" if share <= 1 else f"{share:.3g} times the score"
     return (
-        f"{100 * other.relative_score:.0f} % of the score, "
+        f"{score}, "
         f"differs by {other.rotation_difference_deg:.1f} deg and {length(other.translation_difference, unit, '.4g')}"
     )

@@ -160,8 +160,13 @@ def _explain(error: ValidationError, section: type[Section]) -> str:
         else:
             said = problem["msg"].removeprefix("Value error, ").replace("Input should be", "it must be")
             kind = next((words for start, words in _KINDS.items() if problem["type"].startswith(start)), said)
-            parts.append(f"'{key}' = {problem['input']!r}: {kind}")
+            parts.append(f"'{key}' = {_shown(problem['input'])}: {kind}")
     return "; ".join(parts)
+
+
+def _shown(value: Any) -> str:
+    """A value as YAML writes it, where Python has a word of its own."""
+    return str(value).lower() if isinstance(value, bool) else "null" if value is None else repr(value)
 
 
 def _nearest(key: str, keys: list[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -18,7 +18,8 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _of_its_own(cls, tree: Any) -> Any:
-        """A key of a section inside this one leaves that section's others as they stand here by default."""
+        """A key of a section inside this one leaves that section's others as they stand here by default; true and
+        false are no numbers."""
         if not isinstance(tree, dict):
             return tree
         whole = dict(tree)
@@ -26,11 +27,25 @@ class Section(BaseModel):
             given, default = whole.get(name), info.default
             if isinstance(given, dict) and isinstance(default, Section):
                 whole[name] = {key: getattr(default, key) for key in default.model_fields_set} | given
+            elif {int, float} & (kinds := _kinds(info.annotation)) and bool not in kinds:
+                whole.update({name: _in_words(given)} if name in whole else {})
         return whole
 
     def __hash__(self) -> int:
         """Of the values; options of parts are mappings, which have no hash of their own."""
         return hash(self.model_dump_json())
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """The types that an annotation is made of."""
+    return {annotation}.union(*(_kinds(part) for part in get_args(annotation)))
+
+
+def _in_words(value: Any) -> Any:
+    """A value whose truths are words, which no number is read from; Python takes true for 1."""
+    if isinstance(value, (list, tuple)):
+        return [_in_words(one) for one in value]
+    return str(value).lower() if isinstance(value, bool) else value
 
 
 def constant(

@@ -57,10 +57,9 @@ def remarks(
         )
     if not sensors_known and config.viewpoint in ("auto", "guess"):
         yield (
-            "where the sensors stood is not known and was guessed; more answers are right where it is given: --set "
-            "preparation.viewpoint=origin if they stood at the files' origins, or else, of a single pair, "
-            "`geomoe3d register` with --sensor-source X,Y,Z and --sensor-target, of scans in a map `geomoe3d locate` "
-            "with --sensor X,Y,Z"
+            "where the sensors stood is not known; it was guessed. If you know it, give it: more answers are right "
+            "then (`geomoe3d register`: --sensor-source X,Y,Z and --sensor-target; `locate`: --sensor X,Y,Z; any: "
+            "--set preparation.viewpoint=origin where they stood at the files' origins)"
         )
 
 

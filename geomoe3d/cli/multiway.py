@@ -95,7 +95,7 @@ def command(
 
     Scans without a reliable connection form separate groups; a scan that cannot be placed is listed with
     the reason. Called again with more scans, it reuses all pairs that were registered before. Exit code 0 if
-    all scans are in one group, 3 if not, 2 for unusable input.
+    all scans are in one group and none is doubted (scale, units, mirrored axes), 3 if not, 2 for unusable input.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
 

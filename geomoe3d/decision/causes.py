@@ -16,6 +16,8 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.surfaces import evidence_of
 from geomoe3d.types import PointCloud
 
+MIRRORED = "mirrored"
+
 Register = Callable[[PointCloud, PointCloud], RegistrationResult]
 """Registers two clouds at the scale that they have."""
 
@@ -76,7 +78,7 @@ def mirrored_axes(
         if score < known.mirrored_lead * least or surfaces < known.mirrored_surfaces * least_surfaces:
             return None
     return (
-        f"mirrored: with x of '{name}' the other way round the clouds fit clearly better; if one of "
+        f"{MIRRORED}: with x of '{name}' the other way round the clouds fit clearly better; if one of "
         "them has left-handed axes (often two are exchanged), bring both to right-handed ones, since a rigid transform "
         "cannot mirror"
     )

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -135,6 +135,7 @@ class SceneModel:
         edges: all pairs that gave a transform.
         num_pairs: pairs registered so far.
         seconds: wall time of this call by stage.
+        faults: name of a scan that is placed -> what is wrong with it as a whole: mirrored, or of another unit.
     """
 
     folder: Path
@@ -145,6 +146,7 @@ class SceneModel:
     edges: tuple[EdgeReport, ...]
     num_pairs: int
     seconds: dict[str, float]
+    faults: dict[str, str] = field(default_factory=dict)
 
     @property
     def ok(self) -> bool:
@@ -153,15 +155,15 @@ class SceneModel:
 
     @cached_property
     def doubted(self) -> dict[str, str]:
-        """Name of a scan that is placed -> why it may be wrong there: most of the pairs that hold it, two at least, say
-        that its scale differs."""
+        """Name of a scan that is placed -> why it may be wrong: a fault of its own, or most of the pairs that hold
+        it, two at least, say that its scale differs."""
         found = {}
         for scan in self.scans:
             mine = [e for e in self.edges if e.kept and scan.name in (e.source, e.target)]
             say = [e.reason for e in mine if e.reason.startswith(DIFFERS)]
             if len(say) > max(1, len(mine) / 2):
                 found[scan.name] = f"{len(say)} of the {len(mine)} pairs that hold it say so: {say[0]}"
-        return found
+        return {**found, **self.faults}
 
     def to_json(self) -> str:
         """Everything but the points, in JSON; matrices by rows, every digit."""
@@ -211,6 +213,7 @@ class SceneModel:
                 }
                 for edge in self.edges
             ],
+            "doubted": self.doubted,
             "num_pairs": self.num_pairs,
         }
         return json.dumps(data, indent=1, allow_nan=False) + "\n"

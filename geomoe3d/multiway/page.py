@@ -66,6 +66,7 @@ def render_model_page(model: SceneModel) -> str:
         "groups": model.groups,
         "colors": colors,
         "unplaced": model.unplaced,
+        "doubted": model.doubted,
         "kept": sorted((edge for edge in model.edges if edge.kept), key=lambda edge: -(edge.shift or 0.0)),
         "doubtful": sorted(doubtful, key=lambda edge: -edge.confidence),
     }

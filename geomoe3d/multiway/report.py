@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,9 @@ from geomoe3d.multiway.survey import Survey, key_of
 from geomoe3d.runtime.words import counted
 
 
-def describe_model(survey: Survey, edges: Sequence[Edge], folder: Path, groups: list[Group]) -> SceneModel:
+def describe_model(
+    survey: Survey, edges: Sequence[Edge], folder: Path, groups: list[Group], faults: Mapping[int, str]
+) -> SceneModel:
     """The groups of two or more as a model, the rest with reasons.
 
     Args:
@@ -27,6 +29,7 @@ def describe_model(survey: Survey, edges: Sequence[Edge], folder: Path, groups: 
         edges: all of them, with what cycles say.
         folder: of the model.
         groups: from `geomoe3d.multiway.assembly.Assembly`.
+        faults: what is wrong with scans as a whole, by number.
     """
     origins = {k: shape.origin for k, shape in enumerate(survey.shapes)}
     names = [scan.name for scan in survey.scans]
@@ -41,7 +44,9 @@ def describe_model(survey: Survey, edges: Sequence[Edge], folder: Path, groups: 
         made.append(SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops))
     home = {scan: group for group in placed for scan in group.poses}
     tree = spanning_tree([edge for group in placed for edge in group.edges])
-    unplaced = {names[k]: _why_unplaced(survey, edges, k) for k in range(len(names)) if k not in home}
+    unplaced = {
+        names[k]: faults.get(k) or _why_unplaced(survey, edges, k) for k in range(len(names)) if k not in home
+    }
     return SceneModel(
         folder,
         survey.voxel_size,
@@ -51,6 +56,7 @@ def describe_model(survey: Survey, edges: Sequence[Edge], folder: Path, groups: 
         tuple(_report(survey, edge, home, tree) for edge in edges),
         len(survey.outcomes) + len(survey.map_edges),
         {},
+        {names[k]: told for k, told in faults.items() if k in home},
     )
 
 

@@ -25,6 +25,7 @@ from geomoe3d.multiway.assembly import Assembly
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
 from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
 from geomoe3d.multiway.defaults import NEIGHBORS as NEIGHBORS
+from geomoe3d.multiway.faults import find_faults
 from geomoe3d.multiway.initial import InitialPoses, read_poses
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.pose_graph import Library, require_gtsam
@@ -175,8 +176,10 @@ def register_scans(
         known, groups = groups, assembly.groups()
         if [group.poses.keys() for group in groups] == [group.poses.keys() for group in known]:
             break
+    clock("look again at what nothing sure ties")
+    faults = find_faults(survey, groups, assembly.edges)
     clock("write the model")
-    model = describe_model(survey, assembly.edges, folder, groups)
+    model = describe_model(survey, assembly.edges, folder, groups, faults)
     write_model(model, merged_voxel_size, e57=e57)
     if page:
         from geomoe3d.multiway.page import save_model_page

@@ -15,7 +15,7 @@ from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.prepare import check_cloud
 from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.clouds.voxel_size import bounded_voxel_size, choose_voxel_size
-from geomoe3d.config import PreparationConfig
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
 
 
@@ -112,7 +112,7 @@ def choose_common_voxel_size(
     """One voxel size for all scans, and the scans that cannot be used, with the reason.
 
     It is the median of what each scan would get by itself, rounded to two digits, and raised where a scan
-    would occupy more than ``config.max_points`` voxels.
+    would occupy more than ``config.max_points`` voxels, unless it is so large that it must be in another unit.
 
     Raises:
         InputError: fewer than two scans can be used.
@@ -131,7 +131,8 @@ def choose_common_voxel_size(
         raise InputError(f"fewer than 2 scans can be used: {listed}")
     wanted = common = float(f"{np.median(list(sizes.values())):.2g}")
     for path, size in sizes.items():
-        if size > 2 * common:  # only such a scan can occupy too many voxels
+        # Only such a scan can occupy too many voxels. One so large that no pair of it is registered is in another unit.
+        if 2 * wanted < size < expert().preparation.most_extent_ratio * wanted:
             cloud = load_points(path)
             common = bounded_voxel_size(cloud, cloud, common, config.max_points)
     return (common if common == wanted else _rounded_up(common)), unusable

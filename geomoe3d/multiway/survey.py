@@ -16,7 +16,10 @@ from geomoe3d.batch.table import PairRow
 from geomoe3d.batch.task import open_cache
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.viewpoint import find_viewpoints
+from geomoe3d.clouds.voxel_size import bounded_voxel_size, robust_extent
 from geomoe3d.config import RegistrationConfig, expert
+from geomoe3d.decision.scale import likely_unit_ratio
+from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.alignment import Surface
@@ -32,7 +35,7 @@ from geomoe3d.multiway.scans import Scan, natural_key
 from geomoe3d.registration import Registrar
 from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import Float32Array, FloatArray
+from geomoe3d.types import Float32Array, FloatArray, PointCloud
 
 PairKey = tuple[int, int]
 """Two numbers of scans, the smaller first."""
@@ -114,6 +117,7 @@ class Survey:
         """
         registrar = Registrar(self.config, cache=open_cache(self.labour.cache))
         features: dict[int, Float32Array] = {}
+        odd: dict[int, PointCloud] = {}
         nowhere = Shape(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3))
         for number, scan in enumerate(self.scans):
             self.shapes.append(nowhere)
@@ -122,10 +126,15 @@ class Survey:
                     raise InputError(unusable[scan.name])
                 cloud = load_points(scan.path)
                 view = find_viewpoints(cloud, cloud, self.config.preparation.viewpoint)[0]
-                described = registrar.pipeline.prepare(cloud, self.voxel_size, view, StageClock())
+                odd[number] = cloud
+                # A scan far larger than the others, or in a smaller unit, must not make the grid of all coarser.
+                most = self.config.preparation.max_points
+                size = bounded_voxel_size(cloud, cloud, self.voxel_size, most)
+                described = registrar.pipeline.prepare(cloud, size, view, StageClock())
             except GeoMoE3DError as error:
                 self.unusable[number] = str(error)
                 continue
+            del odd[number]
             assert described.features is not None
             features[number] = described.features
             self.shapes[number] = Shape.of(described.points, described.origin, described.viewpoint)
@@ -133,14 +142,35 @@ class Survey:
         if len(features) < 2:
             raise InputError(f"fewer than 2 scans can be used: {'; '.join(self.unusable.values())}")
         points = {number: surface.points for number, surface in self.surfaces.items()}
+        extent = float(np.median([robust_extent(some) for some in points.values()]))
+        for number, cloud in odd.items():
+            try:
+                features[number] = self._features_in_unit(registrar, cloud, extent)
+            except GeoMoE3DError:  # it stays unlike all others
+                continue
         self.overlaps = Overlaps(points, self.voxel_size, seed=self.config.seed)
         sensors = {k: self.shapes[k].sensor for k, surface in self.surfaces.items() if surface.signed}
         self.free_space = FreeSpace(points, sensors, self.voxel_size, seed=self.config.seed)
         self.similarity = np.full((len(self.scans), len(self.scans)), -np.inf)
-        usable = list(features)
-        between = scan_similarity([features[k] for k in usable], seed=self.config.seed)
-        self.similarity[np.ix_(usable, usable)] = between
+        known = sorted(features)
+        between = scan_similarity([features[k] for k in known], seed=self.config.seed)
+        self.similarity[np.ix_(known, known)] = between
         np.fill_diagonal(self.similarity, -np.inf)
+
+    def _features_in_unit(self, registrar: Registrar, cloud: PointCloud, extent: float) -> Float32Array:
+        """Features of a scan that is of no use as it is, in the unit in which it is about as large as the others.
+
+        Raises:
+            GeoMoE3DError: it is of no use in that unit either, or its extent is not that of another unit.
+        """
+        ratio = likely_unit_ratio((robust_extent(cloud.points), extent))
+        if ratio is None:
+            raise InputError(f"'{cloud.name}' is not of another unit")
+        features = registrar.pipeline.prepare(
+            scaled_cloud(cloud, 1 / ratio), self.voxel_size, None, StageClock()
+        ).features
+        assert features is not None
+        return features
 
     def usable(self) -> list[int]:
         """Numbers of the scans that can be registered."""
@@ -268,6 +298,17 @@ class Survey:
             progress=self._count() or False, say=self.say,
         )  # fmt: skip
         return {name: self.store.outcome(records[name]) for name in unique}
+
+    def register_apart(
+        self, pairs: list[PairKey], config: RegistrationConfig, place: str
+    ) -> dict[PairKey, Outcome]:
+        """Outcomes of pairs by another configuration, kept in a folder of their own beside the others."""
+        if not pairs:
+            return {}
+        store = BatchStore(self.store.folder / place, config)
+        rows = {pair: self._row(pair) for pair in pairs}
+        records, _ = work(list(rows.values()), store, config, self.labour, progress=False, say=self.say)
+        return {pair: store.outcome(records[row.id]) for pair, row in rows.items()}
 
     def _count(self) -> Callable[[int, int], None] | None:
         """Progress of one round, told as that of all pairs so far proposed."""

@@ -1,0 +1,112 @@
+"""What is wrong with a scan as a whole: mirrored axes, another unit. Several of its pairs must say so.
+
+Place: after grouping. Walls and floors of a mirrored scan lie on those of the others, and then many doubtful pairs
+agree on a place for it; but none of them is sure. So parts of the model that nothing sure ties to the rest are looked
+at again, by a few of their pairs, and asked what one pair alone is asked: whether they fit clearly better mirrored, or
+in another unit. Cost: three pairs for each such part, none in a model that sure pairs hold together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from geomoe3d.batch.store import Outcome
+from geomoe3d.config import RegistrationConfig, build_config, expert
+from geomoe3d.decision.causes import MIRRORED
+from geomoe3d.decision.scale import UNITS_DIFFER
+from geomoe3d.multiway.edges import Edge
+from geomoe3d.multiway.proposals import most_similar
+from geomoe3d.multiway.rules import Group
+from geomoe3d.multiway.settling import connected_parts
+from geomoe3d.multiway.survey import PairKey, Survey, key_of
+
+CHECKS_FOLDER = "checks"
+
+
+def find_faults(survey: Survey, groups: Sequence[Group], edges: Sequence[Edge]) -> dict[int, str]:
+    """Number of a scan -> what is wrong with it as a whole.
+
+    Args:
+        survey: the scans and their pairs.
+        groups: as they stand in the end.
+        edges: of all registered pairs, with what triangles say of them.
+    """
+    parts = loose_parts(range(len(survey.scans)), groups)
+    asked = {part: _asked(survey, part, edges) for part in parts[1:]}
+    wanted = sorted({pair for pairs in asked.values() for pair in pairs})
+    checks = survey.register_apart(
+        wanted[: expert().many_pairs.most_checked], of_checks(survey.config), CHECKS_FOLDER
+    )
+    found = mirrored_scans(asked, checks)
+    kept = {id(edge.T_target_source) for group in groups for edge in group.edges}
+    holding = [e for e in edges if id(e.T_target_source) in kept]
+    return {**found, **scans_of_other_units({**survey.outcomes, **checks}, holding)}
+
+
+def of_checks(config: RegistrationConfig) -> RegistrationConfig:
+    """The configuration of a pair that is looked at again: as for one pair alone, on the grid that suits it."""
+    tree = config.model_dump()
+    tree["second_look"]["mirror"] = True
+    return build_config(RegistrationConfig, {**tree, "voxel_size": None})
+
+
+def loose_parts(scans: Iterable[int], groups: Sequence[Group]) -> list[tuple[int, ...]]:
+    """The scans in parts that pairs tie which are too sure to be asked about mirrored axes, the largest first."""
+    sure = [e for group in groups for e in group.edges if e.confidence > expert().causes.sure]
+    return [tuple(part) for part in connected_parts(scans, sure)]
+
+
+def _asked(survey: Survey, part: tuple[int, ...], edges: Sequence[Edge]) -> list[PairKey]:
+    """The pairs of a part with others that are looked at again: the surest, then those that look alike."""
+    count = expert().many_pairs.checked
+    across = [e for e in edges if (e.source in part) != (e.target in part) and not e.of_maps]
+    likely = [key_of(e.source, e.target) for e in sorted(across, key=lambda e: -e.worth)]
+    others = [k for k in survey.usable() if k not in part]
+    alike = [key_of(k, other) for k in part for other in most_similar(survey.similarity, k, others, count)]
+    alike = [pair for pair in alike if survey.similarity[pair] > 0]
+    return list(dict.fromkeys([*likely, *alike]))[:count]
+
+
+def mirrored_scans(
+    asked: Mapping[tuple[int, ...], Sequence[PairKey]], checks: Mapping[PairKey, Outcome]
+) -> dict[int, str]:
+    """Scans of the parts of which two pairs at least, and most, fit clearly better mirrored.
+
+    Args:
+        asked: pairs by part.
+        checks: what became of them.
+    """
+    found: dict[int, str] = {}
+    for part, pairs in asked.items():
+        told = [checks[pair] for pair in pairs if pair in checks]
+        said = [sentence for outcome in told if (sentence := _said(outcome, MIRRORED))]
+        against = sum(outcome.status == "ok" for outcome in told)
+        if len(said) > max(against, 1 if len(told) > 1 else 0):
+            text = (
+                f"{MIRRORED}: {len(said)} of {len(told)} pairs fit clearly better with one of the two scans mirrored; "
+                "if the axes of this one are left-handed (often two are exchanged), bring them to right-handed ones"
+            )
+            found |= dict.fromkeys(part, text)
+    return found
+
+
+def scans_of_other_units(outcomes: Mapping[PairKey, Outcome], holding: Sequence[Edge]) -> dict[int, str]:
+    """Scans that more pairs say to be of another unit than hold them in the model.
+
+    Args:
+        outcomes: of all pairs.
+        holding: edges near the final poses.
+    """
+    said: dict[int, list[str]] = {}
+    for pair, outcome in outcomes.items():
+        sentence = _said(outcome, UNITS_DIFFER)
+        for scan in pair if sentence else ():
+            said.setdefault(scan, []).append(sentence)
+    held = {scan: sum(scan in (e.source, e.target) for e in holding) for scan in said}
+    return {scan: told[0] for scan, told in said.items() if len(told) > held[scan]}
+
+
+def _said(outcome: Outcome, words: str) -> str:
+    """The reason of a pair that begins with some words, else empty."""
+    reasons = () if outcome.result is None else outcome.result.reasons
+    return next((reason for reason in reasons if reason.startswith(words)), "")

@@ -43,7 +43,10 @@ class ManyPairsExpert(Section):
     most_maps: int = constant(32, "pairs", (0, 10_000), "of maps in one round")
     map_rounds: int = constant(2, "rounds", (0, 100), "of local maps")
     checked: int = constant(
-        3, "pairs", (1, 100), "of scans that nothing sure ties to the rest, asked about mirrored axes and units"
+        3,
+        "pairs",
+        (1, 100),
+        "of scans that nothing sure ties to the rest, asked about mirrored axes and units",
     )
     most_checked: int = constant(60, "pairs", (0, 10_000), "so asked in all")
     initial_shift: float = constant(

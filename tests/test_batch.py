@@ -207,6 +207,21 @@ def test_called_again_nothing_is_done_again(scans, finished):
     assert (retried.made, retried.kept) == (2, 3)
 
 
+def test_copies_elsewhere_are_the_same_input_and_other_content_is_another(scans, copied, tmp_path):
+    folder = shutil.copytree(scans[0], tmp_path / "there")
+    table, b = tmp_path / "there" / "pairs.csv", tmp_path / "there" / "b.npy"
+    write_table(table, [("ab", "a", "b"), ("other id", "a", "c"), ("bc", "b", "c")])
+    again = register_pairs(table, copied, config=CONFIG)
+    assert (again.made, again.kept) == (0, 3)
+    assert [outcome.id for outcome in again.outcomes] == ["ab", "other id", "bc"]
+    points, status = np.load(b), b.stat()
+    np.save(b, points[::-1])
+    os.utime(b, ns=(status.st_atime_ns, status.st_mtime_ns))  # neither size nor time tell
+    assert b.stat().st_size == status.st_size
+    again = register_pairs(folder / "pairs.csv", copied, config=CONFIG)
+    assert (again.made, again.kept) == (2, 1)
+
+
 def test_two_processes_give_the_same_bytes(scans, finished, tmp_path):
     _, out = finished
     register_pairs(scans[0] / "pairs.csv", tmp_path / "two", config=CONFIG, workers=2, cache="")

@@ -157,16 +157,21 @@ class BatchStore:
         """Records of the pairs that are done, by id; of a pair that was done twice, the last.
 
         Args:
-            wanted: fingerprint by id; a record of another fingerprint is of another input and not counted.
+            wanted: fingerprint by id. A record of another fingerprint is of another input and not counted; one of
+                another id is that of the same files elsewhere.
             with_errors: False leaves out the pairs that could not be registered.
         """
         found: dict[str, dict[str, Any]] = {}
         if self.begins:
             return found
+        by_input: dict[Any, list[str]] = {}
+        for name, fingerprint in wanted.items():
+            by_input.setdefault(fingerprint, []).append(name)
         for record in read_journal(self.folder / JOURNAL_FILE):
-            name = str(record.get("id"))
-            if name in wanted and record.get("fingerprint") == wanted[name]:
-                found[name] = record
+            for name in by_input.get(record.get("fingerprint"), ()):
+                elsewhere = record.get("error") is None and name not in found
+                if name == record.get("id") or elsewhere:
+                    found[name] = {**record, "id": name}
         if with_errors:
             return found
         return {name: record for name, record in found.items() if record.get("error") is None}

@@ -11,7 +11,7 @@ Medioni, 1992, and the weights of Geman and McClure.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,11 +19,15 @@ from typing import Any
 import numpy as np
 
 from geomoe3d.config import expert
+from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import cross_matrix, inverse, make_transform, project_to_so3, transform_points
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import FloatArray, IntArray, PreparedCloud
+
+Pair = tuple[int, int]
+Pull = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -75,27 +79,22 @@ def align_scans(
         The poses; a scan that overlaps no other by its pose stays where it was.
     """
     scans = sorted(poses)
-    most = expert().many_poses.num_points
-    chosen = {k: drawn_rows(surfaces[k].points, voxel_size, most, seed) for k in scans}
+    known = expert().many_poses
+    chosen = {k: drawn_rows(surfaces[k].points, voxel_size, known.num_points, seed) for k in scans}
     centers = {k: surfaces[k].points.mean(0) for k in scans}
     radius = float(np.median([np.sqrt(surfaces[k].points.var(0).sum()) for k in scans]))
     current = {k: np.array(poses[k]) for k in scans}
-    pairs: list[tuple[int, int]] = []
+    pairs: list[Pair] = []
     asked: dict[int, IntArray] = {}
-    for number, reach in enumerate(expert().many_poses.reaches):
-        if number in (0, expert().many_poses.neighbors_again):
-            pairs = _overlapping(current, overlaps)
+    for number, reach in enumerate(known.reaches):
+        if number in (0, known.neighbors_again):
+            pairs = sorted(overlaps.between(current, current, known.least_overlap))
             count = Counter(source for source, _ in pairs)
             asked = {k: _thinned(chosen[k], count[k]) for k in scans}
         about = {k: transform_points(current[k], centers[k][None])[0] for k in scans}
-        system = _System(scans, {k: _lever(about[k], radius) for k in scans})
-        for source, target in pairs:
-            pull = _pull(
-                surfaces[source], surfaces[target], asked[source],
-                current[source], current[target], reach * voxel_size,
-            )  # fmt: skip
-            system.add(source, target, *pull)
-        for scan, step in system.solve().items():
+        levers = {k: _lever(about[k], radius) for k in scans}
+        pulls = _pulls(pairs, surfaces, asked, current, current, reach * voxel_size)
+        for scan, step in _steps(levers, pulls).items():
             current[scan] = _moved(current[scan], step[:3] / radius, step[3:], about[scan])
     # All may have drifted together; everything is told from where the first scan was.
     back = poses[scans[0]] @ inverse(current[scans[0]])
@@ -118,32 +117,26 @@ def align_groups(
         T_a_b: start, right to about three voxels.
         surfaces, overlaps, voxel_size: as in `align_scans`.
     """
-    shared = [
-        (overlaps.of(j, i, inverse(a[i]) @ T_a_b @ b[j]), i, j)
-        for i in a
-        for j in b
-        if i in surfaces and j in surfaces
-    ]
     known = expert().many_poses
-    pairs = [
-        (i, j) for o, i, j in sorted(shared, reverse=True)[: known.most_pairs] if o >= known.least_overlap
-    ]
-    count = Counter(j for _, j in pairs)
+    usable = {k: T for k, T in a.items() if k in surfaces}
+    there = {k: T_a_b @ T for k, T in b.items() if k in surfaces}
+    shared = overlaps.between(there, usable, known.least_overlap)
+    pairs = sorted(sorted(shared, key=lambda pair: (-shared[pair], pair))[: known.most_pairs])
+    count = Counter(j for j, _ in pairs)
     chosen = {
         j: _thinned(drawn_rows(surfaces[j].points, voxel_size, known.num_points), count[j]) for j in count
     }
     T = T_a_b
     for reach in known.group_reaches if pairs else ():
-        A, slope = np.zeros((6, 6)), np.zeros(6)
         about = np.mean(
-            [transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for _, j in pairs], axis=0
+            [transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for j, _ in pairs], axis=0
         )
         lever = _lever(about, 1.0)
-        for i, j in pairs:
-            one, two = _pull(surfaces[j], surfaces[i], chosen[j], T @ b[j], a[i], reach * voxel_size)
-            A += lever.T @ one @ lever
-            slope += lever.T @ two
-        damping = expert().many_poses.damping * float(np.trace(A)) / 6
+        moved = {j: T @ b[j] for j in count}
+        pulls = _pulls(pairs, surfaces, chosen, moved, a, reach * voxel_size)
+        A = lever.T @ sum(one for one, _ in pulls.values()) @ lever
+        slope = lever.T @ sum(two for _, two in pulls.values())
+        damping = known.damping * float(np.trace(A)) / 6
         if damping <= 0:
             break
         step: FloatArray = np.linalg.solve(A + damping * np.eye(6), slope).astype(np.float64)
@@ -151,45 +144,37 @@ def align_groups(
     return T
 
 
-class _System:
-    """Normal equations over small motions of all scans, each about its own centre.
+def _steps(levers: Mapping[int, FloatArray], pulls: Mapping[Pair, Pull]) -> dict[int, FloatArray]:
+    """Damped small motions (6,) [rotation vector, translation] of all scans at once, each about its own centre.
 
     Args:
-        scans: their numbers.
-        levers: (6, 6) by scan, from `_lever`.
+        levers: (6, 6) by scan, from `_lever`; in their units are the motions.
+        pulls: of the pairs: the source is drawn by the slope, the target pulled back.
     """
+    from scipy.sparse import coo_matrix, identity
+    from scipy.sparse.linalg import spsolve
 
-    def __init__(self, scans: list[int], levers: Mapping[int, FloatArray]) -> None:
-        self._place = {scan: n for n, scan in enumerate(scans)}
-        self._levers = levers
-        self._blocks: dict[tuple[int, int], FloatArray] = {}
-        self._slope = np.zeros((len(scans), 6))
-
-    def add(self, source: int, target: int, A: FloatArray, b: FloatArray) -> None:
-        """Curvature (6, 6) and slope (6,) of one pair: the source is drawn by b, the target pulled back."""
-        for one, sign in ((source, 1.0), (target, -1.0)):
-            self._slope[self._place[one]] += sign * self._levers[one].T @ b
-            for other, same in ((source, 1.0), (target, -1.0)):
-                key = self._place[one], self._place[other]
-                block = sign * same * self._levers[one].T @ A @ self._levers[other]
-                self._blocks[key] = self._blocks.get(key, 0.0) + block
-
-    def solve(self) -> dict[int, FloatArray]:
-        """Damped steps (6,) [rotation vector, translation] in the units of the levers, by scan."""
-        from scipy.sparse import coo_matrix, identity
-        from scipy.sparse.linalg import spsolve
-
-        count = 6 * len(self._slope)
-        keys = np.array(list(self._blocks), dtype=np.int64).reshape(-1, 2)
-        rows, columns = np.mgrid[:6, :6]
-        values = np.array(list(self._blocks.values())).reshape(-1, 6, 6)
-        where = (6 * keys[:, 0, None, None] + rows).ravel(), (6 * keys[:, 1, None, None] + columns).ravel()
-        H = coo_matrix((values.ravel(), where), shape=(count, count)).tocsc()
-        damping = expert().many_poses.damping * float(H.diagonal().mean())
-        if damping <= 0:  # nothing overlaps
-            return {}
-        found = spsolve(H + damping * identity(count, format="csc"), self._slope.ravel()).reshape(-1, 6)
-        return {scan: found[n] for scan, n in self._place.items()}
+    if not pulls:
+        return {}
+    place, L = {scan: n for n, scan in enumerate(levers)}, np.stack(list(levers.values()))
+    ends = np.array([[place[scan] for scan in pair] for pair in pulls])
+    A, b = (np.stack(some) for some in zip(*pulls.values(), strict=True))
+    slope = np.zeros((len(L), 6))
+    keys, blocks = [], []
+    for one, sign in ((ends[:, 0], 1.0), (ends[:, 1], -1.0)):
+        lever = L[one].transpose(0, 2, 1)
+        np.add.at(slope, one, sign * (lever @ b[:, :, None])[:, :, 0])
+        for other, same in ((ends[:, 0], 1.0), (ends[:, 1], -1.0)):
+            keys.append(np.column_stack([one, other]))
+            blocks.append(sign * same * lever @ A @ L[other])
+    where, count = 6 * np.concatenate(keys)[:, :, None, None] + np.mgrid[:6, :6], 6 * len(L)
+    rows, columns = where.transpose(1, 0, 2, 3).reshape(2, -1)
+    H = coo_matrix((np.concatenate(blocks).ravel(), (rows, columns)), shape=(count, count)).tocsc()
+    damping = expert().many_poses.damping * float(H.diagonal().mean())
+    if damping <= 0:  # nothing overlaps
+        return {}
+    found = spsolve(H + damping * identity(count, format="csc"), slope.ravel()).reshape(-1, 6)
+    return {scan: found[n] for scan, n in place.items()}
 
 
 def _thinned(rows: IntArray, neighbors: int) -> IntArray:
@@ -198,51 +183,52 @@ def _thinned(rows: IntArray, neighbors: int) -> IntArray:
     return rows[:: -(-len(rows) // most)] if len(rows) else rows
 
 
-def _overlapping(poses: Mapping[int, FloatArray], overlaps: Overlaps) -> list[tuple[int, int]]:
-    """Pairs (source, target), both ways, of scans that see the same by the poses.
-
-    All of them: with the nearest alone, scans of one place hold each other and let go of the next place.
-    """
-    return [
-        (source, target)
-        for source in poses
-        for target in poses
-        if source != target
-        and overlaps.of(source, target, inverse(poses[target]) @ poses[source])
-        >= expert().many_poses.least_overlap
-    ]
-
-
-def _pull(
-    source: Surface,
-    target: Surface,
-    chosen: IntArray,
-    T_source: FloatArray,
-    T_target: FloatArray,
+def _pulls(
+    pairs: Sequence[Pair],
+    surfaces: Mapping[int, Surface],
+    asked: Mapping[int, IntArray],
+    sources: Mapping[int, FloatArray],
+    targets: Mapping[int, FloatArray],
     reach: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Curvature (6, 6) and slope (6,), about the group's origin, by which a source is drawn into a target.
+) -> dict[Pair, Pull]:
+    """Curvature (6, 6) and slope (6,), about the group's origin, by which each source is drawn into its target.
 
     Args:
-        source, target: the scans.
-        chosen: (n,) points of the source that are asked.
-        T_source, T_target: poses T_group_scan.
+        pairs: (source, target); all of them, since with the nearest alone scans of one place would hold each other
+            and let go of the next place.
+        surfaces: of all scans.
+        asked: (n,) points by source.
+        sources, targets: poses (4, 4) in the group's frame.
         reach: points farther from the target do not count, cloud units.
     """
-    T_target_source = inverse(T_target) @ T_source
-    moved = transform_points(T_target_source, source.points[chosen])
-    distance, nearest = target.tree.query(moved, distance_upper_bound=reach)
-    hit = np.flatnonzero(np.isfinite(distance))
-    nearest = nearest[hit]
-    normals = target.normals[nearest]
-    cosine = np.einsum("ij,ij->i", source.normals[chosen[hit]] @ T_target_source[:3, :3].T, normals)
-    alike = (cosine if source.signed and target.signed else np.abs(cosine)) > expert().many_poses.least_cosine
-    gaps = np.einsum("ij,ij->i", moved[hit] - target.points[nearest], normals)
-    square = (expert().many_poses.gap_scale * reach) ** 2
-    weights = np.where(alike, (square / (square + gaps**2)) ** 2, 0.0)
-    points, normals = transform_points(T_target, moved[hit]), normals @ T_target[:3, :3].T
-    J = np.hstack([np.cross(points, normals), normals])
-    return (J * weights[:, None]).T @ J, -J.T @ (weights * gaps)
+    known, found = expert().many_poses, {}
+    points = {k: transform_points(sources[k], surfaces[k].points[asked[k]]) for k, _ in pairs}
+    normals = {k: surfaces[k].normals[asked[k]] @ sources[k][:3, :3].T for k, _ in pairs}
+    square = (known.gap_scale * reach) ** 2
+    drawn: dict[int, list[int]] = {}
+    for source, number in pairs:
+        drawn.setdefault(number, []).append(source)
+    for number, some in drawn.items():
+        target, T = surfaces[number], targets[number]
+        there = np.concatenate([points[k] for k in some])
+        local = transform_points(inverse(T), there)
+        distance, nearest = target.tree.query(local, distance_upper_bound=reach)
+        hit = np.flatnonzero(np.isfinite(distance))
+        nearest = nearest[hit]
+        facing = target.normals[nearest] @ T[:3, :3].T
+        cosine = np.einsum("ij,ij->i", np.concatenate([normals[k] for k in some])[hit], facing)
+        sizes = [len(points[k]) for k in some]
+        signed = np.repeat([target.signed and surfaces[k].signed for k in some], sizes)[hit]
+        alike = np.where(signed, cosine, np.abs(cosine)) > known.least_cosine
+        gaps = np.einsum("ij,ij->i", local[hit] - target.points[nearest], target.normals[nearest])
+        weights = np.where(alike, (square / (square + gaps**2)) ** 2, 0.0)
+        J = np.hstack([crossed(there[hit], facing), facing])
+        weighted = J * weights[:, None]
+        ends = np.searchsorted(hit, np.cumsum(sizes))
+        for k, low, high in zip(some, np.append(0, ends), ends):  # noqa: B905
+            rows = slice(low, high)
+            found[k, number] = weighted[rows].T @ J[rows], -weighted[rows].T @ gaps[rows]
+    return found
 
 
 def _lever(center: FloatArray, radius: float) -> FloatArray:

@@ -246,14 +246,10 @@ class Survey:
         return map_pairs(usable, edges, self.similarity, self.overlaps, sequence=self.sequence)
 
     def _known(self) -> set[PairKey]:
-        """Pairs in the journal whose scans and files are the same today."""
-        number = {self._row((i, j)).id: (i, j) for j in self.usable() for i in self.usable() if i < j}
-        known = set()
-        for record in read_journal(self.store.folder / JOURNAL_FILE):
-            pair = number.get(str(record.get("id")))
-            if pair is not None and record.get("fingerprint") == self._row(pair).fingerprint():
-                known.add(pair)
-        return known
+        """Pairs in the journal whose scans are the same today, wherever they lie."""
+        stored = {record.get("fingerprint") for record in read_journal(self.store.folder / JOURNAL_FILE)}
+        pairs = [(i, j) for j in self.usable() for i in self.usable() if i < j] if stored else []
+        return {pair for pair in pairs if self._row(pair).fingerprint() in stored}
 
     def _ends(self, pair: PairKey) -> tuple[int, int]:
         """Source and target of a pair: by name, whatever the order in which scans are given."""

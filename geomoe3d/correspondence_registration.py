@@ -22,7 +22,7 @@ from geomoe3d.estimators.proposals import propose
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import residuals, shift_frames
 from geomoe3d.pipeline import Pipeline, resolved
-from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.threads import beside, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.runtime.words import counted
 from geomoe3d.scoring.network import NETWORK, opinion_of
@@ -161,15 +161,18 @@ class CorrespondenceRegistrar:
         num_aligned = settings.num_aligned if matched.normals is None else 0
         estimate = line.estimator.with_less_effort() if num_aligned else line.estimator
         # Only those that the network looks at are drawn closer, below.
-        found = propose(estimate, pair, weighed.weights, settings.model_copy(update={"num_aligned": 0}))
+        unaligned = settings.model_copy(update={"num_aligned": 0})
+        known = expert().correspondences
+        few = likeliest_rows(matched, known.most_rows, pair.inlier_threshold, pair.seed)
+        surfaces = pair.keypoint_surfaces if few is matched else None  # both of these ask for them
+        found, say = beside(
+            lambda: propose(estimate, pair, weighed.weights, unaligned),
+            lambda: network.about(pair if few is matched else replace(pair, matched=few)),
+        )
         if not found:
             return [], FilterOutput(np.zeros(len(matched)))
         clock("score")
-        known = expert().correspondences
-        few = likeliest_rows(matched, known.most_rows, pair.inlier_threshold, pair.seed)
-        surfaces = pair.keypoint_surfaces if few is matched else None
         aligner = KeypointAligner(matched.points, pair.inlier_threshold, surfaces)
-        say = network.about(pair if few is matched else replace(pair, matched=few))
         looked_at: list[Hypothesis] = []
         for lot in (found[: known.first_looked_at], found[known.first_looked_at : known.most_looked_at]):
             if lot and all(_verdict(h) < known.convinced for h in looked_at):

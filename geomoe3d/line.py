@@ -28,13 +28,14 @@ from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
 from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
-from geomoe3d.decision.selection import Selection
+from geomoe3d.decision.selection import Selection, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
 from geomoe3d.geometry.se3 import inverse
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
-from geomoe3d.runtime.threads import each, single_blas_thread
+from geomoe3d.runtime.threads import beside, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
+from geomoe3d.scoring.base import PairScorer
 from geomoe3d.scoring.network import NETWORK, opinion_of
 from geomoe3d.types import Accuracy, FilterOutput, FloatArray, Hypothesis, PointCloud
 
@@ -112,20 +113,18 @@ class Line:
         look = self._best(clouds, prepared, places, sides)
         clock("decide")
         shared = SharedSurface(*look.pair.clouds)
-        if look.decision.answer is not None:
-            with single_blas_thread():
-                look = look._replace(decision=self._made_parallel(look, shared))
         decision, agreeing = look.decision, self._mirrored_agreement(prepared, places)
         asks_mirrored = config.second_look.mirror and self.again is not None
         # None of these needs the others, so they are had side by side.
-        asked = () if decision.answer is None else (look.scale, look.accuracy)
-        tasks: list[Callable[[], Any]] = [partial(measure, shared) for measure in asked]
+        tasks: list[Callable[[], Any]] = []
+        if decision.answer is not None:
+            tasks = [partial(look.scale, shared), partial(self._made_parallel, look, shared)]
         if asks_mirrored and not is_sure(decision.judgement):
             tasks.append(agreeing)
         with single_blas_thread():
             found = each(lambda task: task(), tasks)
         if decision.answer is not None:
-            decision = replace(decision, accuracy=found[1]).with_scale(found[0], exchanged=exchanged)
+            decision = found[1].with_scale(found[0], exchanged=exchanged)
         if decision.judgement.status != "ok":
             units = self._units(clouds[::-1] if exchanged else clouds)
             decision = decision if units is None else decision.with_note(units, first=True)
@@ -199,14 +198,14 @@ class Line:
         clouds = line.flipped(prepared, clock) if sides == "flipped" else prepared
         matched = None if given is None else between_clouds(given, prepared)
         pair = line.match(clouds, places, clock) if matched is None else line.pair(clouds, matched, places)
-        weighed, proposed = line.propose(pair, clock)
         polish = line.refiner.about(pair)  # whatever matches: the clouds stay the same
 
-        def select(pair: Pair, proposed: list[Hypothesis], again: bool = False) -> Selection:
+        def select(pair: Pair, proposed: list[Hypothesis], known: PairScorer | None = None) -> Selection:
+            again = known is None
             config = stricter if again else self.config
             choosing = line.second_scorers if again else {}
             refine = polish if line.refiner.needs_clouds else line.refiner.about(pair)
-            selection = Selection(pair, line.scorers, refine, config, clock, choosing)
+            selection = Selection(pair, line.scorers, refine, config, clock, choosing, known)
             selection.add(proposed)
             if rivals is not None:
                 selection.add(rivals.transforms())
@@ -217,8 +216,12 @@ class Line:
         least = max(self.config.decision.min_confidence, look.min_confidence)
         decide = self.config.decision.model_copy(update={"min_confidence": least})
         stricter = self.config.model_copy(update={"decision": decide})
+        # Proposing keeps one thread busy most of the time.
+        (weighed, proposed), surfaces = beside(
+            lambda: line.propose(pair, clock), lambda: surfaces_of(pair, line.scorers)
+        )
         with single_blas_thread():
-            selection, looks = select(pair, proposed), [pair]
+            selection, looks = select(pair, proposed, surfaces), [pair]
             decision = selection.decide()
             if given is None and sides == "sensor" and self._is_described_again(pair, decision):
                 described = line.described_again(pair.clouds, clock)
@@ -229,7 +232,7 @@ class Line:
                     again, pair = line.matched_again(pair, described, places, clock)
                     looks.append(again)
                     proposed = [*(h.anew() for h in proposed), *line.propose(again, clock)[1]]
-                    weighed, selection = line.weigh(pair), select(pair, proposed, again=True)
+                    weighed, selection = line.weigh(pair), select(pair, proposed)
                     decision = selection.decide(look.num_refined, look.num_judged)
             if self._is_doubtful(decision.judgement):
                 if given is None:
@@ -237,7 +240,7 @@ class Line:
                     if len(looks) > 1:
                         pair = line.together([*more, looks[0], looks[1]], places)
                         proposed = [h.anew() for h in proposed]
-                        weighed, selection = line.weigh(pair), select(pair, proposed, again=True)
+                        weighed, selection = line.weigh(pair), select(pair, proposed)
                     coarser = line.coarser_pairs(prepared, places, clock, sides, len(looks) > 1)
                     for further in chain(more, coarser):
                         selection.add(line.propose(further, clock)[1])
@@ -293,10 +296,13 @@ class Line:
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
     def _made_parallel(self, look: Look, shared: SharedSurface) -> Decision:
-        decision, wanted = look.decision, self.config.refinement
-        if not wanted.parallel or wanted.name not in ("gicp", "icp"):
-            return decision
-        return decision.moved(made_parallel(decision.T_target_source, shared, look.pair.inlier_threshold))
+        """The decision with its answer made parallel, where that is wanted, and how accurate it then is."""
+        wanted, T = self.config.refinement, look.decision.T_target_source
+        if wanted.parallel and wanted.name in ("gicp", "icp"):
+            look = look._replace(
+                decision=look.decision.moved(made_parallel(T, shared, look.pair.inlier_threshold))
+            )
+        return replace(look.decision, accuracy=look.accuracy(shared))
 
     def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
         return None if self.again is None else differing_units(clouds, self.again, self.clock)

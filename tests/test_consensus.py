@@ -141,8 +141,10 @@ def test_distances_and_compatibility_equal_their_definitions() -> None:
     np.testing.assert_allclose(compatibility.distances(p, p), cdist(p, p), atol=0.05)
     q[:30] = p[:30]
     expected = np.abs(cdist(p, p) - cdist(q, q))
-    apart, compatible = compatibility.compatibility(p, q)
-    np.testing.assert_allclose(apart, cdist(p, p), atol=0.05)
+    close, compatible = compatibility.compatibility(p / 20, q / 20, 1 / 20)
+    known = np.abs(cdist(p, p) / 20 - 1) > 1e-3
+    assert (close == (cdist(p, p) / 20 < 1))[known & ~np.eye(60, dtype=bool)].all()
+    assert close.any() and not close.all()
     sure = np.abs(expected - 1) > 1e-3
     off_diagonal = ~np.eye(60, dtype=bool)
     assert ((compatible == 1) == (expected < 1))[sure & off_diagonal].all()
@@ -185,7 +187,7 @@ def test_seeds_are_the_best_supported_and_spread() -> None:
     points[:10] = points[0] + 0.01 * rng.normal(size=(10, 3))  # one bundle with the largest supports
     support = np.r_[np.linspace(50, 41, 10), np.linspace(40, 26, 40)].astype(np.float32)
     ranks = rng.permutation(50).astype(np.uint64)
-    strength = compatibility.strengths(support, cdist(points, points).astype(np.float32))
+    strength = compatibility.strengths(support, cdist(points, points) < 1)
     seeds = compatibility.choose_seeds(strength, ranks, 30)
     # 0 leads; all others of the bundle count half, less than any of the scattered ones. Three quarters of
     # the seeds are the strongest in that order, the others those of the rest that have the lowest ranks.

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from geomoe3d.runtime import threads
-from geomoe3d.runtime.threads import each, usable_threads
+from geomoe3d.runtime.threads import beside, each, usable_threads
 
 
 @pytest.fixture
@@ -51,6 +51,35 @@ def test_one_inside_another_is_a_loop(three_threads):
         return each(lambda _: threading.get_ident(), range(4)) == [outside] * 4
 
     assert all(each(inner, range(6)))
+
+
+def test_two_things_are_done_beside_each_other_and_the_first_may_go_side_by_side(three_threads):
+    meeting = threading.Barrier(3, timeout=10)  # the second, and both items of the first
+    assert beside(lambda: each(lambda _: meeting.wait(), range(2)), lambda: meeting.wait() >= 0)[1] is True
+    assert beside(lambda: 1, lambda: each(lambda _: threading.get_ident(), range(3)))[1][0] > 0
+
+
+def test_beside_with_one_thread_is_one_after_the_other(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    order = []
+    beside(lambda: order.append(threading.get_ident()), lambda: order.append(threading.get_ident()))
+    assert order == [threading.get_ident()] * 2
+
+
+@pytest.mark.parametrize("threads_used", ["1", "3"])
+def test_a_failure_of_the_first_comes_before_one_of_the_second(monkeypatch, threads_used):
+    monkeypatch.setenv("OMP_NUM_THREADS", threads_used)
+    ended = []
+
+    def fail(error):
+        ended.append(error)
+        raise error
+
+    with pytest.raises(KeyError):
+        beside(lambda: fail(KeyError()), lambda: fail(ValueError()))
+    with pytest.raises(ValueError):
+        beside(lambda: None, lambda: fail(ValueError()))
+    assert isinstance(ended[-1], ValueError)
 
 
 def test_many_callers_share_the_helpers(three_threads):

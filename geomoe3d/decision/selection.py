@@ -47,6 +47,7 @@ class Selection:
         choosing: scorers that are asked about refined candidates alone. They help to choose the answer, and by how much
             they prefer it to the best clearly different candidate, the margin, makes the confidence; score and lead
             know nothing of them.
+        surfaces: `surfaces_of` the pair, where somebody has them already.
     """
 
     def __init__(
@@ -57,12 +58,11 @@ class Selection:
         config: RegistrationConfig,
         clock: StageClock,
         choosing: Mapping[str, Scorer] = MappingProxyType({}),
+        surfaces: PairScorer | None = None,
     ) -> None:
-        clock("score")
         self._pair, self._scorers, self._config, self._clock = pair, scorers, config, clock
         self._source, self._choosers = pair.clouds[0], Choosers(choosing, pair, self._differ)
-        surfaces = scorers.get(SURFACES, SurfaceScorer())
-        self._bound: dict[str, PairScorer] = {SURFACES: surfaces.about(pair)}
+        self._bound: dict[str, PairScorer] = {SURFACES: surfaces or surfaces_of(pair, scorers)}
         self._refiner = refiner
         self._first: Hypothesis | None = None
         self._guess: FloatArray | None = None
@@ -327,6 +327,12 @@ class Selection:
     @property
     def _shift(self) -> float:
         return expert().selection.different_shift * self._pair.inlier_threshold
+
+
+def surfaces_of(pair: Pair, scorers: Mapping[str, Scorer]) -> PairScorer:
+    """What asks the clouds of a pair about hypotheses, as the scorers do or, where none of them asks clouds, as is
+    usual."""
+    return scorers.get(SURFACES, SurfaceScorer()).about(pair)
 
 
 def distinct(

@@ -11,7 +11,7 @@ import numpy as np
 from geomoe3d.estimators.surroundings import Surroundings
 from geomoe3d.geometry.draws import Ranks
 from geomoe3d.runtime.threads import each
-from geomoe3d.types import Float32Array, FloatArray, IntArray
+from geomoe3d.types import BoolArray, Float32Array, FloatArray, IntArray
 
 BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
 PAIR_BLOCK = 125  # the same where several such blocks are worked on
@@ -40,14 +40,15 @@ def compatibility(
     target: Float32Array,
     tolerance: float = 1.0,
     surroundings: Surroundings | None = None,
-) -> tuple[Float32Array, Float32Array]:
-    """Distances of the source points (N, N), and how compatible two correspondences are, in [0, 1].
+) -> tuple[BoolArray, Float32Array]:
+    """Which source points lie within a threshold of each other, (N, N), and how compatible two correspondences are,
+    in [0, 1].
 
     0 where they do not preserve length; else 1, or how well their planes agree where those are known.
     Points (N, 3) in inlier thresholds, as the tolerance; the diagonal of the second (N, N) is zero.
     """
-    apart = np.empty((len(source), len(source)), dtype=np.float32)
-    compatible = np.empty_like(apart)
+    close = np.empty((len(source), len(source)), dtype=np.bool_)  # a quarter of what distances would fill
+    compatible = np.empty(close.shape, dtype=np.float32)
 
     agree = None if surroundings is None else surroundings.of_pairs(source, target)
 
@@ -58,15 +59,15 @@ def compatibility(
         gap = distances(target[rows], target[rest])
         gap -= near
         found = np.less(np.abs(gap, out=gap), tolerance, out=gap, casting="unsafe")
+        within = near < 1.0
         if agree is not None:
             found *= agree(rows, near)
-        for whole, part in ((apart, near), (compatible, found)):
-            whole[rows, rest] = part
-            whole[rest, rows] = part.T
+        close[rows, rest], compatible[rows, rest] = within, found
+        close[rest, rows], compatible[rest, rows] = within.T, found.T
 
     each(fill, blocks(np.arange(len(source)), PAIR_BLOCK))
     np.fill_diagonal(compatible, 0)
-    return apart, compatible
+    return close, compatible
 
 
 def blocks(rows: IntArray, size: int = BLOCK) -> list[IntArray]:
@@ -74,10 +75,10 @@ def blocks(rows: IntArray, size: int = BLOCK) -> list[IntArray]:
     return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
-def strengths(support: Float32Array, source_distance: Float32Array) -> Float32Array:
-    """Support (N,), half of it where a neighbour within the threshold has more, so that a dense bundle of wrong matches
-    does not take all places."""
-    beaten = ((source_distance < 1.0) & (support[None, :] > support[:, None])).any(1)
+def strengths(support: Float32Array, close: BoolArray) -> Float32Array:
+    """Support (N,), half of it where one of those that are ``close`` (N, N) has more, so that a dense bundle of wrong
+    matches does not take all places."""
+    beaten = (close & (support[None, :] > support[:, None])).any(1)
     return np.where(beaten, np.float32(0.5) * support, support)
 
 

@@ -180,8 +180,8 @@ class ConsensusEstimator(Estimator):
         p, q = (np.ascontiguousarray(side[rows]) for side in np.hsplit(unit, 2))
         v = vote[rows]
         near = None if surroundings is None else surroundings.take(rows)
-        source_distance, compatible = compatibility(p, q, self.length_tolerance, near)
-        strength = strengths(compatible @ v, source_distance)
+        close, compatible = compatibility(p, q, self.length_tolerance, near)
+        strength = strengths(compatible @ v, close)
         seeds = choose_seeds(strength, ranks[rows], self.num_seeds)
         witnesses = np.sort(choose_seeds(strength, ranks[rows], self.num_witnesses))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import copy_context
 from functools import lru_cache
@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 THREADS_VARIABLE = "OMP_NUM_THREADS"
 
 _lock = threading.Lock()
@@ -97,6 +98,36 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
         for helper in helpers:  # one that never began, as others kept the pool busy, has nothing to do
             helper.cancel()
         return [future.result() for future in futures]
+
+
+def beside(first: Callable[[], Result], second: Callable[[], Other]) -> tuple[Result, Other]:
+    """``(first(), second())``, the second on another thread where one is idle while the caller does the first.
+
+    For a first one that keeps one thread busy most of the time; unlike an item of `each` it may itself go side by side.
+    An exception of the first one comes before one of the second. BLAS and contexts are as in `each`.
+    """
+    if getattr(_inside, "busy", False) or usable_threads() < 2:
+        return first(), second()
+
+    def work() -> Other:
+        _inside.busy = True
+        try:
+            return second()
+        finally:
+            _inside.busy = False
+
+    with single_blas_thread():
+        try:
+            begun = _pool(os.getpid(), usable_threads() - 1).submit(copy_context().run, work)
+        except RuntimeError:  # as in `each`
+            return first(), second()
+        try:
+            found = first()
+        finally:
+            mine = begun.cancel()  # nobody was idle
+            if not mine:
+                wait([begun])
+        return found, second() if mine else begun.result()
 
 
 @lru_cache(maxsize=1)

@@ -51,6 +51,8 @@ class _Side:
     features: Float32Array
     other: PreparedCloud
     similarity: Float32Array
+    best: Float32Array
+    best_there: Float32Array
     of_random: Float32Array
     planarity: FloatArray
     planarity_there: FloatArray
@@ -90,6 +92,8 @@ class SurfaceChannels:
                 features,
                 other,
                 similarity,
+                similarity.max(1),
+                similarity.max(0),
                 similarity[:, random],
                 planarity[k][rows[k]],
                 planarity[1 - k],
@@ -123,7 +127,7 @@ class SurfaceChannels:
         assert other.features is not None
         # Of the features that the network was trained with 0.3 were FPFH.
         fpfh = np.einsum("kni,kni->kn", side.features[x, LEARNED:], other.features[y, LEARNED:]) / 0.3
-        more_similar = (side.of_random[None] > similar[:, :, None]).sum(2)
+        more_similar = np.count_nonzero(side.of_random[None] > similar[:, :, None], axis=2)
         seen: FloatArray = np.zeros(shape)
         margin: FloatArray = np.zeros(shape)
         if side.view is not None:
@@ -131,7 +135,6 @@ class SurfaceChannels:
             saw = np.isfinite(behind)
             seen = saw.astype(np.float64)
             margin = np.clip(np.where(saw, behind, 0.0) / self._threshold, -20.0, 20.0)
-        best = side.similarity.max(1)
         columns = (
             hit,
             np.where(hit, distance, reach) / self._threshold,
@@ -139,15 +142,15 @@ class SurfaceChannels:
             cosine,
             similar,
             fpfh,
-            best - similar,
-            side.similarity.max(0)[y] - similar,
+            side.best - similar,
+            side.best_there[y] - similar,
             -np.log((1 + more_similar) / (1 + side.of_random.shape[1])),
             seen,
             margin,
             np.broadcast_to(side.planarity, shape),
             side.planarity_there[y],
             np.broadcast_to(side.away, shape),
-            np.broadcast_to(best, shape),
+            np.broadcast_to(side.best, shape),
         )
         return np.stack([np.asarray(c, dtype=np.float32) for c in columns], axis=2)
 

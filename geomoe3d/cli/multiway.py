@@ -95,7 +95,8 @@ def command(
 
     Scans without a reliable connection form separate groups; a scan that cannot be placed is listed with
     the reason. Called again with more scans, it reuses all pairs that were registered before. Exit code 0 if
-    all scans are in one group and none is doubted (scale, units, mirrored axes), 3 if not, 2 for unusable input.
+    all scans are in one group and nothing is doubted (scale, units, mirrored axes, repeated structure), 3 if not, 2 for
+    unusable input.
     """
     from geomoe3d.cli.progress import progress_bar, stdout_to_stderr
 
@@ -134,8 +135,8 @@ def summary(model: SceneModel) -> str:
             f"  group {number}: {counted(len(group.poses), 'scan')} in the frame of '{group.reference}'; "
             f"{closed} of {counted(len(group.loops), 'loop')} close"
         )
-        if group.bent:
-            lines.append(click.style(f"    {group.bent}", fg="yellow"))
+        said = [text for text in (group.repeated, group.bent) if text]
+        lines += [click.style(f"    {text}", fg="yellow") for text in said]
     lines += [f"  {name} may be wrong: {reason}" for name, reason in model.doubted.items()]
     if model.unplaced:
         lines.append("not placed:")

@@ -100,6 +100,8 @@ class SceneGroup:
         local_poses: the same between local coordinates, by number of the scan.
         edges: those near the poses.
         loops: of its sure edges, the worst first.
+        contradictions: pairs of its scans that are `ok` by themselves and would have them elsewhere, by more than any
+            bend explains; the surest first.
     """
 
     reference: str
@@ -107,6 +109,7 @@ class SceneGroup:
     local_poses: dict[int, FloatArray]
     edges: tuple[Edge, ...]
     loops: tuple[LoopReport, ...] = ()
+    contradictions: tuple[EdgeReport, ...] = ()
 
     @property
     def bent(self) -> str:
@@ -119,6 +122,18 @@ class SceneGroup:
             f"{len(open_loops)} of {counted(len(self.loops), 'loop')} do not close: going round by "
             f"'{worst.scans[0]}' and '{worst.scans[-1]}' ({counted(len(worst.scans), 'scan')}) ends {worst.shift:.3g} "
             f"and {worst.turn_deg:.1f} deg off; the group may be bent there"
+        )
+
+    @property
+    def repeated(self) -> str:
+        """A sentence where structure seems to repeat, so that parts may stand a period off; else empty."""
+        if not self.contradictions:
+            return ""
+        first = self.contradictions[0]
+        return (
+            f"repeated structure: {counted(len(self.contradictions), 'pair')} that registration is sure of would have "
+            f"scans elsewhere, the surest '{first.source}' and '{first.target}' by {first.shift:.3g} and "
+            f"{first.turn_deg:.0f} deg; a part of the group may be off by one period, as among equal shelves or doors"
         )
 
 
@@ -150,8 +165,9 @@ class SceneModel:
 
     @property
     def ok(self) -> bool:
-        """True where all scans stand in one group, and none is `doubted`."""
-        return len(self.groups) == 1 and not self.unplaced and not self.doubted
+        """True where all scans stand in one group in which no structure seems to repeat, and none is `doubted`."""
+        whole = len(self.groups) == 1 and not self.unplaced
+        return whole and not self.groups[0].repeated and not self.doubted
 
     @cached_property
     def doubted(self) -> dict[str, str]:
@@ -180,6 +196,7 @@ class SceneModel:
                         for name, T in group.poses.items()
                     ],
                     "bent": group.bent,
+                    "repeated": group.repeated,
                     "loops": [
                         {
                             "scans": list(loop.scans),

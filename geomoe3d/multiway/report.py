@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.config import expert
 from geomoe3d.decision.scale import DIFFERS
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.multiway.edges import Edge, agrees, differences, expected_error, predicted_motion
@@ -34,6 +35,9 @@ def describe_model(
     origins = {k: shape.origin for k, shape in enumerate(survey.shapes)}
     names = [scan.name for scan in survey.scans]
     placed = [group for group in groups if len(group.poses) > 1]
+    home = {scan: group for group in placed for scan in group.poses}
+    tree = spanning_tree([edge for group in placed for edge in group.edges])
+    told = [(edge, _report(survey, edge, home, tree)) for edge in edges]
     made = []
     for group in placed:
         reference, poses = file_poses(group.poses, survey.scans, origins)
@@ -41,9 +45,13 @@ def describe_model(
             LoopReport(tuple(names[k] for k in loop.scans), loop.shift, loop.turn_deg, loop.closes)
             for loop in find_loops(group.poses, edges, survey.shapes, survey.voxel_size)
         )
-        made.append(SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops))
-    home = {scan: group for group in placed for scan in group.poses}
-    tree = spanning_tree([edge for group in placed for edge in group.edges])
+        elsewhere = [
+            report for edge, report in told if report.source in poses and _is_elsewhere(survey, edge, report)
+        ]
+        elsewhere.sort(key=lambda report: -report.confidence)
+        made.append(
+            SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops, tuple(elsewhere))
+        )
     unplaced = {
         names[k]: faults.get(k) or _why_unplaced(survey, edges, k) for k in range(len(names)) if k not in home
     }
@@ -53,11 +61,20 @@ def describe_model(
         tuple(survey.scans),
         tuple(made),
         unplaced,
-        tuple(_report(survey, edge, home, tree) for edge in edges),
+        tuple(report for _, report in told),
         len(survey.outcomes) + len(survey.map_edges),
         {},
         {names[k]: told for k, told in faults.items() if k in home},
     )
+
+
+def _is_elsewhere(survey: Survey, edge: Edge, report: EdgeReport) -> bool:
+    """Whether a pair within a group was `ok` by itself and moves its source farther from the poses than bends do."""
+    outcome = None if edge.of_maps else survey.outcomes.get(key_of(edge.source, edge.target))
+    if report.shift is None or report.turn_deg is None or outcome is None or outcome.status != "ok":
+        return False
+    bent, rules = expert().many_groups.bent, survey.rules
+    return report.shift > bent * rules.tolerance or report.turn_deg > bent * rules.turn_deg
 
 
 def _report(survey: Survey, edge: Edge, home: dict[int, Group], tree: set[int]) -> EdgeReport:

@@ -53,6 +53,12 @@ class ManyPairsExpert(Section):
         2.0, "voxels", (0.001, 1000), "standard deviation of given poses between two scans"
     )
     initial_turn_deg: float = constant(2.0, "degrees", (0.001, 180), "the same of their turn")
+    overlap_reach: float = constant(
+        1.5,
+        "-",
+        (0.1, 100),
+        "times the distance between sampled points: a thinned surface has holes of that size",
+    )
     overlap_sample: int = constant(
         400, "points", (10, 1_000_000), "of each scan by which overlaps are measured"
     )
@@ -150,6 +156,12 @@ class ManyGroupsExpert(Section):
     )
     bends_from: int = constant(
         3, "scans", (2, 10_000), "of both groups that may be bent to be joined, where rigidly nothing is sure"
+    )
+    fitted_from: float = constant(
+        1.25,
+        "ratio of scans",
+        (1.001, 100),
+        "by which a group has grown by single scans when its poses are fitted anew",
     )
     rival: float = constant(
         0.25, "share", (0, 1), "of the worth of the best: a transform that the scans are asked about again"

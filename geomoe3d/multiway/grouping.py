@@ -243,14 +243,22 @@ class Growth:
             ]
             way = replace(way, supporters=believed)
         edges, poses = self._joined(a, b, way)
+        before, neighbors = self.groups[a].poses, {k for pair in self._between if b in pair for k in pair}
         self.groups.pop(b)
         self.groups[a] = Group(poses, edges)
+        stays = not self._bending and all(poses[scan] is T for scan, T in before.items())
         crossing, self._between = self._between, {}
         for pair, some in crossing.items():
             c, d = sorted(a if number == b else number for number in pair)
             if c != d:
                 self._between.setdefault((c, d), []).extend(some)
-        self._ways = {pair: ways for pair, ways in self._ways.items() if not {a, b} & set(pair)}
+        # To groups that nothing ties to b the ways are what they were, unless scans have been asked about them.
+        self._ways = {
+            pair: ways
+            for pair, ways in self._ways.items()
+            if not {a, b} & set(pair)
+            or (stays and neighbors.isdisjoint(set(pair) - {a}) and not any(way.weighed for way in ways))
+        }
 
 
 def lead(ways: Sequence[Motion]) -> float:
@@ -276,5 +284,5 @@ def _between_groups(edge: Edge, a: Group, b: Group) -> FloatArray:
 
 
 def _octave(count: int) -> int:
-    """Rises by one with every quarter more: optimising after each single scan would cost its square."""
-    return int(np.log(count) / np.log(1.25))
+    """Rises by one with every so many more: optimising after each single scan would cost its square."""
+    return int(np.log(count) / np.log(expert().many_groups.fitted_from))

@@ -81,5 +81,6 @@ class Overlaps:
         tree = cKDTree(points)
         if len(points) < 2:
             return tree, 0.0
-        # A thinned surface has holes of the size of its points' distances.
-        return tree, 1.5 * float(np.median(np.asarray(tree.query(points, k=2)[0])[:, 1]))
+        return tree, expert().many_pairs.overlap_reach * float(
+            np.median(np.asarray(tree.query(points, k=2)[0])[:, 1])
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -141,7 +142,10 @@ def choose_common_voxel_size(
 def _rounded_up(size: float) -> float:
     """To two digits, never down: a size raised to a limit of voxels must not fall below it again."""
     digits = float(f"{size:.2g}")
-    return digits if digits >= size else float(f"{size * 1.05:.2g}")
+    if digits < size:
+        last = math.floor(math.log10(size)) - 1  # place of the second digit
+        digits = float(f"{digits + 10.0**last:.2g}")
+    return digits
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:

@@ -28,6 +28,7 @@ from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transf
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.places import Query, Window
 from geomoe3d.maps.sight import Sight, seen_factor
+from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.runtime.timing import StageClock
@@ -277,10 +278,12 @@ class Search:
             judgement = Judgement("ambiguous", reasons, min(judgement.confidence, most))
             sure = False
         decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
+        T, pair = decision.T_target_source, best.pair
+        decision = shown(self._line, pair, decision, self._clock)
+        sure = sure and decision.judgement.status == "ok"
         if answer.note is not None:
             decision = decision.with_note(answer.note)
         self._clock("decide")
-        T, pair = decision.T_target_source, best.pair
         shared = SharedSurface(*pair.clouds)
         scale = measure_scale(T, shared)
         if scale is not None:  # maps are bent where their scans were joined

@@ -176,6 +176,12 @@ class LocatingExpert(Section):
     twin_voters: int = constant(
         32, "points", (10, 1_000_000), "of the map around a place that vote for its copies"
     )
+    twin_asked: int = constant(
+        300,
+        "points",
+        (10, 1_000_000),
+        "of the map around a place that are matched with a window: its copy has most of them",
+    )
     twin_apart: float = constant(
         1.5, "radii", (1, 100), "of a scan between a place and a window, within which they share points"
     )

@@ -86,6 +86,8 @@ class Finder:
                 level = self._other(search, cloud, own)
             elif look == "finer":
                 known = [*known, *(T for first in known[:1] for T in whole.twins(first, count))]
+                if best is not None and best.decision.answer is not None:
+                    known.append(best.decision.T_target_source)
                 level = self._around(search, known, own)
             else:
                 level = search.level
@@ -110,7 +112,8 @@ class Finder:
                 known += twins
                 twinned = twinned or sum(f.stood for f in found) > 1
             latest, others = search.decide(found)
-            if best is None or latest.sure or latest.confidence > best.confidence:
+            # The last look has seen the answers before it, and more of the scan than they did.
+            if best is None or latest.sure or look == "finer" or latest.confidence > best.confidence:
                 best, ranked = latest, others
             if latest.sure:
                 break

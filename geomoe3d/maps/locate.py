@@ -169,14 +169,16 @@ class Search:
         part = Compared(points[near], level.normals[level.rows[near]], level.features[near])
         voters = part.features[:: math.ceil(len(near) / known.twin_voters)]
         windows = self._query.windows(4 * count, voters=voters)
-        query = Query(part, level, seed=self.config.seed)
-        least, place = known.close * self._quick(T), Hypothesis(T)
+        drawn = np.random.default_rng(self.config.seed).permutation(len(near))[: known.twin_asked]
+        query = Query(part.take(np.sort(drawn)), level, seed=self.config.seed)
+        own, place = self._quick(T), Hypothesis(T)
+        least, worth = known.close * own, known.worth_polishing * own
         found: list[tuple[float, Hypothesis]] = []
         for window in _likest(windows, center, self.reach):
             moved = [Hypothesis(h.T_target_source @ T) for h in query.motions(window, 3)]
             # Windows that reach the place hold its own points, too.
             moved = [h for h in moved if self.differ(place, h)]
-            if moved:
+            if moved and self._quick(moved[0].T_target_source, worth) > worth:
                 twin = self._polished(moved[0].T_target_source)
                 found.append((self._quick(twin, least), Hypothesis(twin)))
         found = [(score, h) for score, h in found if score > least]

@@ -85,6 +85,15 @@ class MapsExpert(Section):
     least_twin: int = constant(
         30, "points", (3, 1_000_000), "of the map around a place, by which copies of it are sought"
     )
+    finest: float = constant(
+        1.25,
+        "voxels",
+        (1, 100),
+        "of what a map keeps, of the finest grid on which it is described beforehand",
+    )
+    least_weight: float = constant(
+        1e-4, "1 - cosine", (1e-9, 1), "of two neighbours that face the same way: a tree holds no zeros"
+    )
     facing_neighbors: int = constant(10, "points", (2, 1000), "along which the signs of normals are carried")
 
 
@@ -92,6 +101,10 @@ class PlacesExpert(Section):
     """Windows of a map and the transforms proposed in them (`maps/places.py`)."""
 
     asked: int = constant(1000, "points", (10, 1_000_000), "of the scan that are matched")
+    reach: float = constant(0.95, "share", (0, 1), "of the scan's points within its radius")
+    cell: float = constant(2 / 3, "radii", (0.01, 10), "edge of the cells of which windows are made")
+    window: float = constant(1.25, "radii", (0.1, 10), "of a window, between the corners of its cells")
+    apart: float = constant(0.6, "radii", (0, 10), "between the centres of two windows at least")
     voting: int = constant(
         200,
         "points",
@@ -227,6 +240,21 @@ class LocatingExpert(Section):
         (0.1, 100),
         "deviation of a scale measured in a map, in deviations of a pair",
         "of 208 right answers in maps it denies none, 1.0 one; of 24 scans 4 % off 1.35 let two more pass",
+    )
+    reach: float = constant(
+        0.98, "share", (0, 1), "of the scan's points within its reach, beside which strays lie"
+    )
+    better: float = constant(
+        1.05, "ratio", (1, 10), "of quick scores: what ends a further search, over what was known before"
+    )
+    damping: float = constant(
+        1e-3, "points", (0, 1000), "added to what holds a transform that is drawn closer"
+    )
+    unseen: float = constant(
+        0.05,
+        "share",
+        (0, 1),
+        "of the map's points, for so many that stand where the scan's sensor did not look",
     )
     margin: float = constant(
         6.0,

@@ -28,7 +28,7 @@ def facing_alike(points: FloatArray, normals: FloatArray) -> FloatArray:
     rows, columns = np.repeat(np.arange(n), k), np.asarray(near)[:, 1:].ravel()
     cosine = np.einsum("ij,ij->i", normals[rows], normals[columns])
     # Nothing may weigh zero: a sparse matrix would not hold it.
-    weights = 1.0 - np.abs(cosine) + 1e-4
+    weights = 1.0 - np.abs(cosine) + expert().maps.least_weight
     tree = minimum_spanning_tree(coo_matrix((weights, (rows, columns)), shape=(n, n)).tocsr())
     parent = np.arange(n)
     count, part = connected_components(tree, directed=False)

@@ -97,7 +97,7 @@ class Search:
         self.center = scan.points.mean(0)
         self.eye = self.center if scan.viewpoint is None else scan.viewpoint
         reach = np.linalg.norm(scan.points - self.center, axis=1)
-        self.reach = float(np.quantile(reach, 0.98))
+        self.reach = float(np.quantile(reach, expert().locating.reach))
         threshold = self.config.estimator.inlier_threshold * scan.voxel_size
         self._apart = expert().selection.different_shift * threshold
         margin = expert().locating.margin * scan.voxel_size
@@ -203,7 +203,7 @@ class Search:
         known = expert().locating
         scored = [(self._quick(T), Hypothesis(T)) for T in given]
         # What was known before did not convince, or it would not be asked again.
-        plain = max([known.plain, *(1.05 * score for score, _ in scored)]) if more else known.plain
+        plain = max([known.plain, *(known.better * score for score, _ in scored)]) if more else known.plain
         found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
         for number, window in enumerate(windows):
             if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
@@ -318,7 +318,7 @@ class Search:
             center = moved[hit].mean(0)
             gaps = np.einsum("ij,ij->i", level.points[np.asarray(nearest)[hit]] - moved[hit], there)
             J = np.hstack([np.cross(moved[hit] - center, there), there])
-            step = np.linalg.solve(J.T @ J + 1e-3 * np.eye(6), J.T @ gaps)
+            step = np.linalg.solve(J.T @ J + expert().locating.damping * np.eye(6), J.T @ gaps)
             turn = Rotation.from_rotvec(step[:3]).as_matrix()
             T = make_transform(turn, center + step[3:] - turn @ center) @ T
         return T
@@ -347,7 +347,7 @@ class Search:
         margin, _ = self._view.margins(transform_points(inverse(T), level.points[around]))
         violation = float(
             (margin < -expert().locating.seen_through * voxel).sum()
-            / (np.isfinite(margin).sum() + 0.05 * len(around))
+            / (np.isfinite(margin).sum() + expert().locating.unseen * len(around))
         )
         return agreement * float(np.exp(-expert().surfaces.violation_weight * violation))
 

@@ -199,7 +199,7 @@ class Map:
         sizes = [] if wanted is None else [wanted]
         if wanted is None:
             usual = min(max(known.usual_points, self.num_points // known.usual_share), known.most_points)
-            finest = max(self._voxels.edge_for(usual), 1.25 * self._voxels.edge)
+            finest = max(self._voxels.edge_for(usual), known.finest * self._voxels.edge)
             coarsest = self._voxels.edge_for(known.least_described)
             sizes = [
                 round_size(times * finest) for times in (1, 2, 4) if times * finest < coarsest or times == 1

@@ -72,7 +72,9 @@ class Query:
         self._scan = scan.take(
             np.sort(np.random.default_rng(seed).permutation(len(scan.points))[: expert().places.asked])
         )
-        self.radius = float(np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), 0.95))
+        self.radius = float(
+            np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), expert().places.reach)
+        )
 
     @single_blas_thread()
     def windows(
@@ -107,6 +109,7 @@ class Query:
         counts = np.add.reduceat(np.ones(len(cells.order)), cells.starts)
         sums = np.add.reduceat(level.points[cells.order], cells.starts, axis=0)
         ends = np.append(cells.starts[1:], len(cells.order))
+        apart = expert().places.apart * self.radius
         found: list[Window] = []
         for k in np.argsort(-votes, kind="stable"):
             if len(found) == count:
@@ -115,7 +118,7 @@ class Query:
             center = sums[m].sum(0) / counts[m].sum()
             if within is not None and np.linalg.norm(center - within[0]) > within[1] + self.radius:
                 continue
-            if any(np.linalg.norm(center - window.center) < 0.6 * self.radius for window in found):
+            if any(np.linalg.norm(center - window.center) < apart for window in found):
                 continue
             keys = np.concatenate([cells.order[cells.starts[j] : ends[j]] for j in m])
             found.append(Window(center, np.sort(keys), float(votes[k])))
@@ -125,7 +128,7 @@ class Query:
     def _cells(self) -> _Cells:
         from scipy.spatial import cKDTree
 
-        level, edge = self.level.compared, self.radius / 1.5
+        level, edge = self.level.compared, expert().places.cell * self.radius
         cells = np.floor(level.points / edge).astype(np.int64)
         cells -= cells.min(0)
         shape = tuple(cells.max(0) + 1)
@@ -134,7 +137,7 @@ class Query:
         starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
         places = np.stack(np.unravel_index(flat[order][starts], shape), axis=1)
         members = cKDTree(places).query_ball_point(
-            places, 1.25 * self.radius / edge + 1e-6, return_sorted=True
+            places, expert().places.window * self.radius / edge + 1e-6, return_sorted=True
         )
         return _Cells(order, starts, list(members), np.ascontiguousarray(level.features[order].T))
 

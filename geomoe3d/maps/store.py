@@ -28,7 +28,6 @@ from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 
 VERSION = 4
-_SAME = 1e-9  # of one transform that was written and read again, in each number
 _LEVEL = tuple(field.name for field in fields(Level) if field.name not in ("voxel_size", "sensors"))
 _VOXELS = ("origin", "keys", "sums", "counts", "towards", "sensors")
 
@@ -63,7 +62,7 @@ class Source:
             return self.sha256 == sha256  # a version that kept no paths kept no transforms either
         if self.sha256 == sha256:
             own = np.eye(4) if self.T_map_cloud is None else np.array(self.T_map_cloud)
-            if not np.allclose(own, T, rtol=_SAME, atol=_SAME):
+            if not np.allclose(own, T, rtol=1e-9, atol=1e-9):
                 shift, turn = motions_apart(own, T, np.zeros(3))
                 off = f"{shift:.3g} and {turn:.3g} deg from where it is put now"
                 what = f"is in the map already, {off}; give the pose it had, or"

@@ -280,3 +280,16 @@ def test_register_seeks_the_small_cloud_in_the_large_one_whichever_comes_first(b
     assert shift(back.inverse().T_target_source, true) < 0.05
     assert back.source.num_input == len(building)
     assert back.num_inliers == back.inliers.sum() > 0
+
+
+def test_far_from_the_origin_no_millimetre_is_lost(rooms, building, scan):
+    """At national grid coordinates, and in a part of the map that lies 20 km from its first cloud."""
+    points, true = scan
+    at_home = Map.from_cloud(building - UTM, voxel_size=GRID).locate(points)
+    far = np.array([20_000.0, 0.0, 0.0])
+    two_towns = Map.empty(voxel_size=GRID).with_cloud(building).with_cloud(scanned(rooms[0], UTM + far, 1))
+    found = two_towns.locate(points, near=true[:3, 3] + far, within=3.0)
+    assert found.ok
+    for T, moved in ((found.T_map_scan, far), (at_home.T_map_scan, -UTM)):
+        assert np.linalg.norm(T[:3, 3] - moved - true[:3, 3]) < 0.005
+        np.testing.assert_allclose(T[:3, :3], true[:3, :3], atol=0.005)

@@ -41,20 +41,24 @@ from geomoe3d.types import Accuracy, FilterOutput, FloatArray, Hypothesis, Point
 
 
 class Look(NamedTuple):
-    """What one look at a pair gave: the clouds and matches that were judged, what the filter said, the decision."""
+    """What one look at a pair gave: the clouds and matches that were judged, what the filter said, the decision, and
+    what measures where the clouds lie on each other."""
 
     pair: Pair
     weighed: FilterOutput
     decision: Decision
+    shared: SharedSurface
 
-    def scale(self, shared: SharedSurface) -> Scale | None:
+    def scale(self) -> Scale | None:
         """See `measure_scale`."""
-        return measure_scale(self.decision.T_target_source, shared)
+        return measure_scale(self.decision.T_target_source, self.shared)
 
-    def accuracy(self, shared: SharedSurface) -> Accuracy | None:
+    def accuracy(self) -> Accuracy | None:
         """See `measure_accuracy`."""
         pair = self.pair
-        return measure_accuracy(self.decision.T_target_source, shared, pair.matched, pair.inlier_threshold)
+        return measure_accuracy(
+            self.decision.T_target_source, self.shared, pair.matched, pair.inlier_threshold
+        )
 
 
 @dataclass
@@ -112,13 +116,12 @@ class Line:
         prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock, sides)
         look = self._best(clouds, prepared, places, sides)
         clock("decide")
-        shared = SharedSurface(*look.pair.clouds)
         decision, agreeing = look.decision, self._mirrored_agreement(prepared, places)
         asks_mirrored = config.second_look.mirror and self.again is not None
         # None of these needs the others, so they are had side by side.
         tasks: list[Callable[[], Any]] = []
         if decision.answer is not None:
-            tasks = [partial(look.scale, shared), partial(self._made_parallel, look, shared)]
+            tasks = [look.scale, partial(self._made_parallel, look)]
         if asks_mirrored and not is_sure(decision.judgement):
             tasks.append(agreeing)
         with single_blas_thread():
@@ -216,10 +219,15 @@ class Line:
         least = max(self.config.decision.min_confidence, look.min_confidence)
         decide = self.config.decision.model_copy(update={"min_confidence": least})
         stricter = self.config.model_copy(update={"decision": decide})
+
+        def needed_later() -> tuple[PairScorer, SharedSurface]:
+            surfaces, shared = surfaces_of(pair, line.scorers), SharedSurface(*pair.clouds)
+            if self.config.refinement.parallel:
+                shared.directions  # noqa: B018 - kept there
+            return surfaces, shared
+
         # Proposing keeps one thread busy most of the time.
-        (weighed, proposed), surfaces = beside(
-            lambda: line.propose(pair, clock), lambda: surfaces_of(pair, line.scorers)
-        )
+        (weighed, proposed), (surfaces, shared) = beside(lambda: line.propose(pair, clock), needed_later)
         with single_blas_thread():
             selection, looks = select(pair, proposed, surfaces), [pair]
             decision = selection.decide()
@@ -245,7 +253,7 @@ class Line:
                     for further in chain(more, coarser):
                         selection.add(line.propose(further, clock)[1])
                 decision = selection.decide(look.num_refined, look.num_judged)
-        return Look(pair, weighed, decision)
+        return Look(pair, weighed, decision, shared)
 
     def _is_described_again(self, pair: Pair, decision: Decision) -> bool:
         """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little and has a rival or
@@ -284,9 +292,9 @@ class Line:
 
     def _finished(self, look: Look, clouds: tuple[PointCloud, PointCloud]) -> Explanation:
         """The result of a look, with what led to it."""
-        pair, weighed, decision = look
+        pair, weighed, decision, _ = look
         if decision.answer is not None and decision.accuracy is None:
-            decision = replace(decision, accuracy=look.accuracy(SharedSurface(*pair.clouds)))
+            decision = replace(decision, accuracy=look.accuracy())
         if NETWORK in self.pipeline.scorers:
             opinion = opinion_of(decision.answer)
             said = None if opinion is None else opinion.output
@@ -295,14 +303,14 @@ class Line:
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
-    def _made_parallel(self, look: Look, shared: SharedSurface) -> Decision:
+    def _made_parallel(self, look: Look) -> Decision:
         """The decision with its answer made parallel, where that is wanted, and how accurate it then is."""
         wanted, T = self.config.refinement, look.decision.T_target_source
         if wanted.parallel and wanted.name in ("gicp", "icp"):
             look = look._replace(
-                decision=look.decision.moved(made_parallel(T, shared, look.pair.inlier_threshold))
+                decision=look.decision.moved(made_parallel(T, look.shared, look.pair.inlier_threshold))
             )
-        return replace(look.decision, accuracy=look.accuracy(shared))
+        return replace(look.decision, accuracy=look.accuracy())
 
     def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
         return None if self.again is None else differing_units(clouds, self.again, self.clock)
@@ -329,4 +337,4 @@ class Line:
         for remark in clouds[1].notes:
             decision = decision.with_note(remark)
         weighed = FilterOutput(np.zeros(len(found.pair.matched)))
-        return self._finished(Look(found.pair, weighed, decision), clouds)
+        return self._finished(Look(found.pair, weighed, decision, SharedSurface(*found.pair.clouds)), clouds)

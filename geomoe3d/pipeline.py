@@ -201,7 +201,8 @@ class Pipeline:
         if self.second_descriptor is None:
             raise ValueError("there is no second descriptor")
         clock("features")
-        source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in clouds)
+        second, first = self.second_descriptor, self.descriptor
+        source, target = each(lambda cloud: with_features(cloud, second, first), clouds)
         return source, target
 
     def matched_again(
@@ -238,9 +239,7 @@ class Pipeline:
                 continue
             coarse = self.flipped(coarse, clock) if sides == "flipped" else coarse
             if again and self.second_descriptor is not None:
-                clock("features")
-                source, target = (with_features(c, self.second_descriptor, self.descriptor) for c in coarse)
-                coarse = source, target
+                coarse = self.described_again(coarse, clock)
             yield self.match(coarse, places, clock)
 
     def warm_up(self) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from surface_pairs import motion, pair, perturbation, prepared, surfaces
 
-from geomoe3d.decision.parallel import made_parallel, main_directions, with_right_angles
-from geomoe3d.decision.shared_surface import SharedSurface
+from geomoe3d.decision.parallel import made_parallel, with_right_angles
+from geomoe3d.decision.shared_surface import SharedSurface, main_directions
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
 
 VOXEL = 0.1

@@ -16,10 +16,8 @@ import numpy as np
 from geomoe3d.config import expert
 from geomoe3d.decision.accuracy import covariance_of
 from geomoe3d.decision.shared_surface import SharedSurface
-from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.geometry.se3 import cross_matrix, make_transform
-from geomoe3d.runtime.threads import each
-from geomoe3d.types import FloatArray, PreparedCloud
+from geomoe3d.types import FloatArray
 
 
 def made_parallel(T_target_source: FloatArray, shared: SharedSurface, threshold: float) -> FloatArray:
@@ -34,7 +32,7 @@ def made_parallel(T_target_source: FloatArray, shared: SharedSurface, threshold:
         threshold: of an inlier, cloud units.
     """
     known = expert().parallel
-    ours, theirs = each(main_directions, (shared.source, shared.target))
+    ours, theirs = shared.directions
     ours, theirs = paired_directions(ours @ T_target_source[:3, :3].T, with_right_angles(theirs))
     contact = shared.contact(T_target_source, threshold)
     if not len(ours) or len(contact.gaps) < expert().accuracy.least_points:
@@ -59,29 +57,6 @@ def made_parallel(T_target_source: FloatArray, shared: SharedSurface, threshold:
             information, np.append(np.einsum("n,nij,ni->j", weights, J, apart), np.zeros(3))
         )
     return _moved(T_target_source, step[:3] / radius, step[3:], center)
-
-
-def main_directions(cloud: PreparedCloud) -> FloatArray:
-    """Unit normals (k, 3), of either sign, that many points share within some degrees; most shared first."""
-    known = expert().parallel
-    left = cloud.normals[drawn_rows(cloud.points, cloud.voxel_size, known.most_asked)]
-    least = max(known.least_share * len(left), 3)
-    near, wide = np.cos(np.radians([known.width_deg, 2 * known.width_deg]))
-    found: list[FloatArray] = []
-    while len(left) >= least and len(found) < known.most_directions:
-        seeds = left[:: max(1, len(left) // known.num_seeds)]
-        direction = seeds[(np.abs(seeds @ left.T) > near).sum(1).argmax()]
-        for _ in range(known.shifts):
-            weights = np.maximum((np.abs(left @ direction) - wide) / (1 - wide), 0.0) ** 2
-            direction = np.linalg.eigh((left * weights[:, None]).T @ left)[1][:, -1]
-        cosines = np.abs(left @ direction)
-        inside, around = (cosines > near).sum(), (cosines > wide).sum()
-        if around < least:
-            break
-        if inside >= known.least_density * around:  # else a round surface
-            found.append(direction)
-        left = left[cosines <= wide]
-    return np.array(found).reshape(-1, 3)
 
 
 def with_right_angles(directions: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from geomoe3d.decision.confidence import Judgement, judge, lead_over
 from geomoe3d.decision.information import measure_information
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
 from geomoe3d.refinement.base import PairRefiner
+from geomoe3d.runtime.threads import each
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import PairScorer, Scorer
 from geomoe3d.scoring.surfaces import SURFACES, SurfaceScorer, evidence_of
@@ -136,7 +137,7 @@ class Selection:
             return decision
         self._clock("refine")
         different = (h for h in self.hypotheses if self._differ(answer, h))
-        others = [self._refine(h) for h in distinct(different, self._source, self._shift, count)]
+        others = self._refine_all(distinct(different, self._source, self._shift, count))
         margin = Choosers(choosing, pair, self._differ).margin(answer, [*others, decision.alternative])
         if margin is None:
             return decision
@@ -226,7 +227,7 @@ class Selection:
             return self._refine(self._first)
         asked = [h for h in self.hypotheses if all(name in h.asked for name in selective)]
         best = distinct(asked or self.hypotheses, self._source, self._shift, num_refined)
-        self._candidates = [self._refine(h) for h in best]
+        self._candidates = self._refine_all(best)
         values = np.array([candidate.score for candidate in self._candidates])
         liked = self._choosers.likings(self._candidates)
         if liked is not None:
@@ -244,6 +245,13 @@ class Selection:
             hypothesis.refined = replace(refined, is_refined=True)
             self.hypotheses.append(hypothesis.refined)
         self._rank()
+
+    def _refine_all(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """`_refine` of each, those that were not refined before side by side."""
+        todo = [h for h in hypotheses if not h.is_refined and h.refined is None]
+        for hypothesis, refined in zip(todo, self._refined(todo), strict=True):
+            hypothesis.refined = refined
+        return [self._refine(h) for h in hypotheses]
 
     def _refine(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis refined and scored, or as it was where that made the clouds fit less well.
@@ -274,8 +282,7 @@ class Selection:
             return replace(hypothesis, scores=known, asked={SURFACES}, note=note)
 
         found: list[Hypothesis] = []
-        for hypothesis in hypotheses:
-            T, note = self._refiner(hypothesis)
+        for hypothesis, (T, note) in zip(hypotheses, each(self._refiner, hypotheses), strict=True):
             if T is None or T is hypothesis.T_target_source:
                 found.append(unrefined(hypothesis, note))
             else:
@@ -291,11 +298,14 @@ class Selection:
         """The best clearly different hypothesis, and the answer's lead over it."""
         best: Hypothesis | None = None
         different = (h for h in self.hypotheses if self._differ(answer, h))
-        for other in distinct(different, self._source, self._shift, expert().selection.most_rivals):
-            # A fair race: a rival that could matter is refined too. One that refines to the answer itself was only
-            # proposed less well, and is none: how far off it was proposed is an accident.
-            close = lead_over(answer.score, other.score) < expert().confidence.most_lead
-            refined = self._refine(other) if close else other
+        others = distinct(different, self._source, self._shift, expert().selection.most_rivals)
+        # A fair race: a rival that could matter is refined too. One that refines to the answer itself was only proposed
+        # less well, and is none: how far off it was proposed is an accident.
+        most_lead = expert().confidence.most_lead
+        close = [h for h in others if lead_over(answer.score, h.score) < most_lead]
+        polished = dict(zip(map(id, close), self._refine_all(close), strict=True))
+        for other in others:
+            refined = polished.get(id(other), other)
             if not self._differ(answer, refined):
                 continue
             other = max(other, refined, key=lambda h: h.score)

@@ -7,6 +7,7 @@ asked. One for all who ask about a pair; a question costs some 3 ms.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from geomoe3d.clouds.evidence import Met
 from geomoe3d.config import expert
 from geomoe3d.geometry.columns import crossed
 from geomoe3d.geometry.draws import drawn_rows
+from geomoe3d.runtime.threads import each
 from geomoe3d.types import FloatArray, PreparedCloud
 
 
@@ -50,6 +52,12 @@ class SharedSurface:
             for most in (known.most_asked, known.few_asked)
         )
 
+    @cached_property
+    def directions(self) -> tuple[FloatArray, FloatArray]:
+        """`main_directions` of source and target."""
+        ours, theirs = each(main_directions, self._clouds)
+        return ours, theirs
+
     def contact(
         self, T_target_source: FloatArray, reach: float, scale: float = 1.0, *, few: bool = False
     ) -> Contact:
@@ -74,6 +82,29 @@ class SharedSurface:
         points, normals = moved[first][agree], normals[agree]
         gaps = np.einsum("ij,ij->i", target.points[second][agree] - points, normals)
         return Contact(points, normals, gaps, (len(ours.rows) / len(rows), len(back.rows) / len(back_rows)))
+
+
+def main_directions(cloud: PreparedCloud) -> FloatArray:
+    """Unit normals (k, 3), of either sign, that many points share within some degrees; most shared first."""
+    known = expert().parallel
+    left = cloud.normals[drawn_rows(cloud.points, cloud.voxel_size, known.most_asked)]
+    least = max(known.least_share * len(left), 3)
+    near, wide = np.cos(np.radians([known.width_deg, 2 * known.width_deg]))
+    found: list[FloatArray] = []
+    while len(left) >= least and len(found) < known.most_directions:
+        seeds = left[:: max(1, len(left) // known.num_seeds)]
+        direction = seeds[(np.abs(seeds @ left.T) > near).sum(1).argmax()]
+        for _ in range(known.shifts):
+            weights = np.maximum((np.abs(left @ direction) - wide) / (1 - wide), 0.0) ** 2
+            direction = np.linalg.eigh((left * weights[:, None]).T @ left)[1][:, -1]
+        cosines = np.abs(left @ direction)
+        inside, around = (cosines > near).sum(), (cosines > wide).sum()
+        if around < least:
+            break
+        if inside >= known.least_density * around:  # else a round surface
+            found.append(direction)
+        left = left[cosines <= wide]
+    return np.array(found).reshape(-1, 3)
 
 
 def robust_weights(gaps: FloatArray, voxel_size: float) -> FloatArray:

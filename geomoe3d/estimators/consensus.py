@@ -30,6 +30,7 @@ from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.estimators.compatibility import (
     BLOCK,
     PAIR_BLOCK,
+    REFIT_BLOCK,
     blocks,
     bundle_weights,
     choose_seeds,
@@ -224,15 +225,18 @@ class ConsensusEstimator(Estimator):
     ) -> tuple[FloatArray, FloatArray]:
         """Motions after so many rounds of `refit`; one that stays where it is takes part in no further one."""
         R, t = R.copy(), t.copy()
-        moving = np.arange(len(R))
-        for _ in range(rounds):
-            R_new, t_new = refit(R[moving], t[moving], known, vote)
-            turned = np.abs(R_new - R[moving]).max((1, 2)) > self.still_turn
-            shifted = np.abs(t_new - t[moving]).max(1) > self.still_shift
-            R[moving], t[moving] = R_new, t_new
-            moving = moving[turned | shifted]
-            if not len(moving):
-                break
+
+        def part(moving: IntArray) -> None:
+            for _ in range(rounds):
+                R_new, t_new = refit(R[moving], t[moving], known, vote)
+                turned = np.abs(R_new - R[moving]).max((1, 2)) > self.still_turn
+                shifted = np.abs(t_new - t[moving]).max(1) > self.still_shift
+                R[moving], t[moving] = R_new, t_new
+                moving = moving[turned | shifted]
+                if not len(moving):
+                    break
+
+        each(part, blocks(np.arange(len(R)), REFIT_BLOCK))
         return R, t
 
     def _distinct_rows(self, R: FloatArray, t: FloatArray, scores: FloatArray, limit: int) -> list[int]:

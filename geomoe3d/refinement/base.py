@@ -15,7 +15,7 @@ from geomoe3d.types import FloatArray, Hypothesis
 
 PairRefiner = Callable[[Hypothesis], "tuple[FloatArray | None, str | None]"]
 """A hypothesis to its transform (4, 4) refined and None; or to its own, unchanged, and a sentence that says why;
-or to None where nothing is left of it."""
+or to None where nothing is left of it. Several may be refined at a time, by threads."""
 
 
 class Refiner(Part):

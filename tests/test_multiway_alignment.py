@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from pose_graphs import largest_error
@@ -10,7 +12,7 @@ from small_scans import CUTS, SETTINGS, cut, scene
 
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import load_config
-from geomoe3d.geometry.se3 import inverse, make_transform
+from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
 from geomoe3d.multiway.alignment import Surface, align_scans
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.types import PointCloud
@@ -63,3 +65,21 @@ def test_a_scan_that_overlaps_nothing_stays_where_it_was(surfaces):
     assert np.abs(one[3] - truth[3]).max() < 1e-12
     among = align_scans(moved_about(truth, np.random.default_rng(2), 0.01, 0.05), made, overlaps, 0.12)
     assert largest_error({k: among[k] for k in range(6)}, truth) < 0.03
+
+
+def test_overlaps_of_many_are_the_shares_of_points_within_reach(surfaces):
+    _, truth, overlaps = surfaces
+    found = overlaps.between(truth, truth)
+    some = overlaps.between(truth, truth, 0.3)
+    assert some == {pair: share for pair, share in found.items() if share >= 0.3}
+    assert 4 <= len(some) < len(found)
+    for source, target in product(range(7), range(7)):
+        if source == target:
+            continue
+        T = inverse(truth[target]) @ truth[source]
+        asked, known = overlaps._points[source], overlaps._points[target]
+        gaps = np.linalg.norm(transform_points(T, asked)[:, None] - known[None], axis=2).min(axis=1)
+        expected = (gaps < overlaps._tree(target)[1]).mean()
+        assert found.get((source, target), 0.0) == pytest.approx(expected, abs=0.003)
+        assert overlaps.of(source, target, T) == pytest.approx(expected, abs=0.003)
+    assert overlaps.of(0, 99, np.eye(4)) == 0.0

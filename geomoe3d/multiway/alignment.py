@@ -50,6 +50,11 @@ class Surface:
         return cls(cloud.points, cloud.normals, cloud.viewpoint is not None)
 
     @cached_property
+    def center(self) -> FloatArray:
+        """(3,) mean of the points."""
+        return self.points.mean(0)
+
+    @cached_property
     def tree(self) -> Any:
         """A `scipy.spatial.cKDTree` of the points, built when first asked."""
         from scipy.spatial import cKDTree
@@ -81,7 +86,7 @@ def align_scans(
     scans = sorted(poses)
     known = expert().many_poses
     chosen = {k: drawn_rows(surfaces[k].points, voxel_size, known.num_points, seed) for k in scans}
-    centers = {k: surfaces[k].points.mean(0) for k in scans}
+    centers = {k: surfaces[k].center for k in scans}
     radius = float(np.median([np.sqrt(surfaces[k].points.var(0).sum()) for k in scans]))
     current = {k: np.array(poses[k]) for k in scans}
     pairs: list[Pair] = []
@@ -94,7 +99,8 @@ def align_scans(
         about = {k: transform_points(current[k], centers[k][None])[0] for k in scans}
         levers = {k: _lever(about[k], radius) for k in scans}
         pulls = _pulls(pairs, surfaces, asked, current, current, reach * voxel_size)
-        for scan, step in _steps(levers, pulls).items():
+        steps = _steps(levers, pulls)
+        for scan, step in steps.items():
             current[scan] = _moved(current[scan], step[:3] / radius, step[3:], about[scan])
     # All may have drifted together; everything is told from where the first scan was.
     back = poses[scans[0]] @ inverse(current[scans[0]])
@@ -128,9 +134,7 @@ def align_groups(
     }
     T = T_a_b
     for reach in known.group_reaches if pairs else ():
-        about = np.mean(
-            [transform_points(T @ b[j], surfaces[j].points.mean(0)[None])[0] for j, _ in pairs], axis=0
-        )
+        about = np.mean([transform_points(T @ b[j], surfaces[j].center[None])[0] for j, _ in pairs], axis=0)
         lever = _lever(about, 1.0)
         moved = {j: T @ b[j] for j in count}
         pulls = _pulls(pairs, surfaces, chosen, moved, a, reach * voxel_size)

@@ -43,6 +43,10 @@ def test_a_mirrored_scan_and_one_in_millimetres_are_named(tmp_path):
     assert told["scan_3"].startswith("units differ: with all lengths of 'scan_3.npy' divided by 1000")
     assert "'scan_3.npy' seems to be in millimetres" in told["scan_3"]
     assert set(told) == {"scan_1", "scan_3"}
+    files = [tmp_path / f"scan_{number}.npy" for number in (0, 1, 2)]
+    other = config.model_copy(update={"seed": 1})
+    again = register_scans(files, tmp_path / "model", config=other, page=False, rounds=0, fresh=True)
+    assert again.unplaced["scan_1"].startswith("mirrored: 2 of 2 pairs")
 
 
 def test_parts_are_what_pairs_tie_that_are_too_sure_to_be_asked():

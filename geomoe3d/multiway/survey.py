@@ -301,7 +301,11 @@ class Survey:
         """Outcomes of pairs by another configuration, kept in a folder of their own beside the others."""
         if not pairs:
             return {}
-        store = BatchStore(self.store.folder / place, config)
+        folder = self.store.folder / place
+        try:
+            store = BatchStore(folder, config)
+        except InputError:  # of an earlier model, which this one replaces
+            store = BatchStore(folder, config, fresh=True)
         rows = {pair: self._row(pair) for pair in pairs}
         records, _ = work(list(rows.values()), store, config, self.labour, progress=False, say=self.say)
         return {pair: store.outcome(records[row.id]) for pair, row in rows.items()}

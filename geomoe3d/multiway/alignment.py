@@ -52,7 +52,8 @@ class Surface:
     @cached_property
     def center(self) -> FloatArray:
         """(3,) mean of the points."""
-        return self.points.mean(0)
+        mean: FloatArray = self.points.mean(0)
+        return mean
 
     @cached_property
     def tree(self) -> Any:

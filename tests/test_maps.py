@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,6 +110,27 @@ def test_a_scan_of_another_building_is_not_ok_and_is_sought_on_a_coarser_grid_to
     assert not made.locate(scan[0]).ok
     assert made.voxel_sizes[0] == pytest.approx(GRID / 2)
     assert made.voxel_sizes[-1] > 1.3 * GRID / 2
+
+
+def test_the_last_look_on_the_finest_grid_has_the_last_word(house, scan, monkeypatch):
+    """It has seen the answers before it; how sure it is does not count."""
+    sizes = []
+
+    def doubtful(self, found, _made=Search.decide):
+        best, ranked = _made(self, found)
+        sizes.append(self.level.voxel_size)
+        judgement = Judgement("low_confidence", (), 0.9 / len(sizes))
+        return replace(
+            best, sure=False, stood=True, decision=replace(best.decision, judgement=judgement)
+        ), ranked
+
+    monkeypatch.setattr(Search, "decide", doubtful)
+    made = Map(house._voxels)
+    made.describe(2 * GRID)
+    found = made.locate(scan[0])
+    assert sizes[-1] < min(sizes[:-1])
+    assert found.result.voxel_size == sizes[-1]
+    assert shift(found.T_map_scan, scan[1]) < 0.05
 
 
 def test_a_place_that_is_given_is_looked_at_and_not_trusted(house, scan):

@@ -16,12 +16,16 @@ from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.information import Information
 from geomoe3d.maps import stranger
 from geomoe3d.maps.stranger import LOOKS_STRANGE, shown
+from geomoe3d.networks.motion_judge import Judged
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import Belief
-from geomoe3d.types import Correspondences, Hypothesis
+from geomoe3d.scoring.network import NETWORK, Opinion
+from geomoe3d.types import Correspondences, FilterOutput, Hypothesis
 
 
-def asked(factor, status="ok", confidence=0.99, config=None, *, has_margin=True, descriptor="learned"):
+def asked(
+    factor, status="ok", confidence=0.99, config=None, *, opinion=None, has_margin=True, descriptor="learned"
+):
     """What becomes of a decision where the network multiplies by a factor."""
 
     def about(pair):
@@ -39,7 +43,8 @@ def asked(factor, status="ok", confidence=0.99, config=None, *, has_margin=True,
     )
     nothing = Information(np.eye(6), np.zeros(3), 0.1, 100)
     judgement = Judgement(status, (), confidence)
-    decision = Decision(Hypothesis(np.eye(4)), None, np.inf, nothing, judgement)
+    answer = Hypothesis(np.eye(4), scores={} if opinion is None else {NETWORK: opinion})
+    decision = Decision(answer, None, np.inf, nothing, judgement)
     return shown(line, Pair(matched, 0.1, 0.2, 0, *clouds), decision, StageClock()).judgement
 
 
@@ -47,6 +52,14 @@ def test_an_ok_answer_that_the_network_holds_for_wrong_is_not_ok():
     denied = asked(0.5)
     assert (denied.status, denied.reasons, denied.confidence) == ("low_confidence", (LOOKS_STRANGE,), 0.79)
     assert asked(2.0) == Judgement("ok", (), 0.99)
+
+
+def test_the_network_of_the_matches_has_a_voice_if_it_was_asked():
+    judged = Judged(0.0, lambda: FilterOutput(np.zeros(0)))
+    assert asked(np.exp(-0.7), opinion=Opinion(4.0, judged)).status == "ok"
+    assert asked(np.exp(-0.7), opinion=Opinion(1.0, judged)).status == "low_confidence"
+    assert asked(np.exp(0.7), opinion=Opinion(-4.0, judged)).status == "low_confidence"
+    assert asked(np.exp(-0.7), opinion=Opinion(4.0)).status == "low_confidence"  # assumed
 
 
 def test_it_is_not_asked_where_it_can_change_nothing_or_nobody_wants_it():

@@ -32,6 +32,7 @@ from geomoe3d.geometry.se3 import check_motion, inverse
 from geomoe3d.line import Line
 from geomoe3d.pipeline import Pipeline, resolved, with_weights
 from geomoe3d.result import RegistrationResult
+from geomoe3d.runtime.threads import each
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, PointCloud
 
@@ -149,8 +150,7 @@ class Registrar:
         if initial is not None:
             _check_guess_is_wanted(config)
         clock("load")
-        loaded = _load(source, "source", seed), _load(target, "target", seed)
-        loaded = with_sensors(loaded, sensors, config.preparation.viewpoint)
+        loaded = with_sensors(_load_both(source, target, seed), sensors, config.preparation.viewpoint)
         clouds = without_missing(loaded[0]), without_missing(loaded[1])
         for cloud in clouds:
             check_cloud(cloud)
@@ -245,6 +245,15 @@ def _check_guess_is_wanted(config: RegistrationConfig) -> None:
             "a first guess is weighed against the hypotheses by scorers, but scoring.scorers is empty; leave "
             "one of the two out"
         )
+
+
+def _load_both(source: Any, target: Any, seed: int) -> tuple[PointCloud, PointCloud]:
+    """Side by side what is in memory; not all that reads files can be called by two threads."""
+    both = (source, "source"), (target, "target")
+    if any(isinstance(data, (str, os.PathLike)) for data, _ in both):
+        return _load(source, "source", seed), _load(target, "target", seed)
+    first, second = each(lambda one: _load(*one, seed), both)
+    return first, second
 
 
 def _load(data: Any, role: str, seed: int) -> PointCloud:

@@ -73,7 +73,7 @@ def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
 
     A factor of 50 is far beyond partial overlap of two scans, and far below millimetres against metres.
     """
-    extents = [robust_extent(cloud.points) for cloud in (source, target)]
+    extents = each(robust_extent, (source.points, target.points))
     small, large = sorted(extents)
     most = expert().preparation.most_extent_ratio
     if small <= 0 or large / small < most:

@@ -192,6 +192,10 @@ def test_adding_a_scan_reuses_every_earlier_pair(scanned_room, tmp_path):
     again = register_scans([files[3], files[0], files[1], files[2]], tmp_path, config=CONFIG, page=False)
     assert (tmp_path / "pairs" / JOURNAL_FILE).read_bytes() == after
     assert again.to_json() == more.to_json()
+    there = shutil.copytree(folder, tmp_path / "there")  # the same scans are known wherever they lie
+    moved = [there / files[k].name for k in (3, 0, 1, 2)]
+    register_scans(moved, tmp_path, config=CONFIG, page=False)
+    assert (tmp_path / "pairs" / JOURNAL_FILE).read_bytes() == after
 
 
 def test_the_command_places_and_exits_with_three(scanned_room, tmp_path):

@@ -31,7 +31,7 @@ from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
 from geomoe3d.decision.selection import Selection, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
-from geomoe3d.geometry.se3 import inverse
+from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
 from geomoe3d.runtime.threads import beside, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
@@ -154,8 +154,10 @@ class Line:
                 prepared = self.pipeline.prepare_both(clouds, size, (None, None), self.clock, sides)
             other = self._look(prepared, None, sides, best.decision)
             surer = other.decision.judgement.confidence > best.decision.judgement.confidence
-            # Without sensors less speaks against a wrong answer, so it is taken only where it is sure.
-            if surer and (sides == "flipped" or other.decision.judgement.status == "ok"):
+            # Without sensors less speaks against a wrong answer, so it is taken only where it is sure, and never where
+            # it lays believed ones on each other: this look could not see that what matches is their own pattern.
+            sure = other.decision.judgement.status == "ok" and not _on_each_other(places, other)
+            if surer and (sides == "flipped" or sure):
                 best = other
         return best
 
@@ -338,3 +340,11 @@ class Line:
             decision = decision.with_note(remark)
         weighed = FilterOutput(np.zeros(len(found.pair.matched)))
         return self._finished(Look(found.pair, weighed, decision, SharedSurface(*found.pair.clouds)), clouds)
+
+
+def _on_each_other(places: Places, look: Look) -> bool:
+    """Whether an answer lays sensors that are believed to have stood at ``places`` on each other."""
+    if places is None:
+        return False
+    apart = transform_points(look.decision.T_target_source, places[0][None])[0] - places[1]
+    return float(np.linalg.norm(apart)) < expert().confidence.near_sensors * look.pair.voxel_size

@@ -86,7 +86,6 @@ def test_help_loads_no_library():
     assert done.stdout.splitlines()[-1] == "0 []"
 
 
-
 def test_the_help_sets_options_for_experts_apart(capsys):
     assert call("register", "--help") == 0
     usual, expert = capsys.readouterr().out.split("Options for experts:")

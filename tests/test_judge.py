@@ -97,6 +97,22 @@ def test_where_sensor_lies_on_sensor_the_surface_must_hold_more() -> None:
     assert measure_information(T, *two, VOXEL).sensors_apart == pytest.approx(4 * VOXEL / source.voxel_size)
 
 
+def test_where_sensor_lies_on_sensor_a_rival_that_fits_nearly_as_well_makes_ambiguous() -> None:
+    """Each scan's own pattern fits itself: car parks, meeting rooms and pipe racks were ok by it, turned or shifted."""
+    answer, config = scored(evidence(2.0), 9.0), DecisionConfig()
+    for apart, share, overlap, status in (
+        (1.0, 0.5, 0.85, "ambiguous"),
+        (1.0, 0.2, 0.85, "ok"),  # it fits far worse
+        (1.0, 0.5, 0.5, "ok"),  # it lies on little
+        (20.0, 0.5, 0.85, "ok"),  # the sensors do not lie on each other
+    ):
+        rival = scored(evidence(2.0 * share, overlap=overlap), -3.0)
+        information = replace(FIRM, sensors_apart=apart)
+        judged = confidence.judge(answer, rival, 50.0, 0.05, information, config)
+        assert judged.status == status, (apart, share, overlap)
+        assert (status == "ok") == (judged.confidence > 0.9)
+
+
 @pytest.mark.parametrize(
     ("agreeing", "matches", "points", "status"),
     [

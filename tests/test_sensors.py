@@ -58,6 +58,33 @@ def test_one_place_alone_is_refused_where_the_other_is_not_known(sensors: tuple)
         geomoe3d.register(*clouds(), sensors=sensors)
 
 
+def spun(height: float = 1.0) -> np.ndarray:
+    """A room of 10 x 8 x 3, as a sensor at the origin sees it that spins: rays at equal angles, all around."""
+    azimuth, elevation = np.radians(np.meshgrid(np.arange(0.5, 360, 1.0), np.arange(-39, 40, 2.0))).reshape(
+        2, -1
+    )
+    rays = np.stack(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1
+    )
+    low, high = np.array([-4.9, -4.2, -height]), np.array([5.1, 3.8, 3 - height])
+    with np.errstate(divide="ignore"):
+        return rays * np.where(rays > 0, high / rays, low / rays).min(axis=1)[:, None]
+
+
+def test_a_spinning_sensor_is_believed_at_the_origin_though_the_mean_lies_near_it() -> None:
+    points = spun()
+    extent = np.linalg.norm(np.ptp(points, axis=0))
+    assert np.linalg.norm(points.mean(axis=0)) < 0.025 * extent
+    scan = geomoe3d.load_points(points)
+    place, _ = find_viewpoints(scan, scan, "auto")
+    assert np.allclose(place, -scan.origin)
+    # Where its mean was subtracted the origin is no sensor's place, nor where only the grid of a thinned cloud is left.
+    thinned = points[np.unique(np.floor(points / 0.4), axis=0, return_index=True)[1]]
+    for moved in (points - points.mean(axis=0), thinned):
+        cloud = geomoe3d.load_points(moved)
+        assert find_viewpoints(cloud, cloud, "auto") == (None, None)
+
+
 def test_a_place_and_another_rule_exclude_each_other() -> None:
     with pytest.raises(ConfigError, match="leave one of the two out"):
         with_sensors(clouds(), ("none", None), "guess")
@@ -82,4 +109,5 @@ def test_what_is_advised_where_sensors_are_guessed_names_the_verb_that_has_the_o
     cloud = PreparedCloud(points, points, None, 0.1, None, np.zeros(3))
     doubtful = Judgement("low_confidence", (), 0.5)
     (said,) = remarks((points, points[::-1]), (cloud, cloud), 0.1, False, PreparationConfig(), doubtful)
-    assert said.index("preparation.viewpoint=origin") < said.index("`geomoe3d register` with --sensor-source")
+    assert said.index("`geomoe3d register`: --sensor-source") < said.index("`locate`: --sensor X,Y,Z")
+    assert "preparation.viewpoint=origin" in said

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geomoe3d.clouds.voxel_grid import voxel_keys
 from geomoe3d.config import expert
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.geometry.columns import bounds
@@ -30,10 +31,10 @@ def find_viewpoints(
     Rule ``auto`` believes that a sensor stood at the file's origin when that lies within one extent of the
     cloud, as it does for depth cameras and single laser scans, and never for georeferenced data, nor where
     the cloud was plainly moved there: its mean, the middle of its box or its lowest corner lies at the
-    origin. Where it does not, the place is believed that the file itself gives (the pose of its one scan, or
-    VIEWPOINT), within the same limit. A place that the user gave is believed as it is. ``origin`` always; ``guess``
-    and ``centroid`` never. Normals of the two
-    clouds must be turned by the same rule, hence both or none.
+    origin, and points do not thin out away from it as the rays of a spinning sensor do. Where it does not,
+    the place is believed that the file itself gives (the pose of its one scan, or VIEWPOINT), within the same
+    limit. A place that the user gave is believed as it is. ``origin`` always; ``guess`` and ``centroid``
+    never. Normals of the two clouds must be turned by the same rule, hence both or none.
     """
     if rule in ("guess", "centroid"):
         return None, None
@@ -159,8 +160,41 @@ def _sensor_may_be_at_origin(cloud: PointCloud) -> bool:
     mean = cloud.points.mean(axis=0) + cloud.origin
     known = expert().viewpoint
     middle = (low + high) / 2
-    moved = (mean, known.moved_mean), (middle, known.moved_middle), (low, known.moved_corner)
-    return all(float(np.linalg.norm(place)) >= least * extent for place, least in moved)
+    away = (
+        [float(np.linalg.norm(place)) / extent for place in (mean, middle, low)] if extent > 0 else [0.0] * 3
+    )
+    limits = (known.moved_mean, known.moved_middle, known.moved_corner)
+    if all(far >= least for far, least in zip(away, limits, strict=True)):
+        return True
+    return min(away) >= known.moved_exactly and _thinning(cloud) <= known.most_thinning
+
+
+def _thinning(cloud: PointCloud) -> float:
+    """Rank correlation between how many points fill a cell and how far it lies from the file's origin, in [-1, 1].
+
+    Rays from one place spread, so around a sensor it is well below zero, and the mean of what a sensor saw all around
+    lies near it by nature. Clouds that were thinned to a grid, sampled or merged have about none.
+    Source: Spearman, 1904.
+    """
+    known = expert().viewpoint
+    points = cloud.points
+    if len(points) > known.thinning_points:
+        points = points[np.random.default_rng(0).choice(len(points), known.thinning_points, replace=False)]
+    cell = float(np.linalg.norm(np.subtract(*bounds(points)))) / known.thinning_cells
+    _, first, count = np.unique(voxel_keys(points, cell), return_index=True, return_counts=True)
+    if len(count) < 3:
+        return 0.0
+    ranks = [_ranks(values) for values in (count, np.linalg.norm(points[first] + cloud.origin, axis=1))]
+    spread = float(np.prod([np.std(rank) for rank in ranks]))
+    return float(np.cov(*ranks, bias=True)[0, 1]) / spread if spread > 0 else 0.0
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Ranks of values (n,); equal ones share the mean of theirs."""
+    _, which, count = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(count)
+    found: FloatArray = (last - (count - 1) / 2.0)[which]
+    return found
 
 
 def sign_breaks(cloud: PreparedCloud) -> float:

@@ -86,6 +86,21 @@ class ViewpointExpert(Section):
         "from the origin to the lowest corner, likewise",
         "fragments 0.37 at least, laser scans in rooms 0.22",
     )
+    moved_exactly: float = constant(
+        1e-4,
+        "extents",
+        (0, 1),
+        "any of these three nearer: the cloud was moved there, whatever its points are like",
+    )
+    most_thinning: float = constant(
+        -0.5,
+        "rank correlation",
+        (-1, 1),
+        "of points in a cell and its distance from the origin, with which a sensor is believed there all the same",
+        "raw scans all around -0.54 to -0.83; thinned, sampled, merged and centred clouds -0.33 at least",
+    )
+    thinning_cells: float = constant(60.0, "cells", (2, 10_000), "of which the extent has so many")
+    thinning_points: int = constant(100_000, "points", (100, 100_000_000), "at most that are counted")
     most_sign_breaks: float = constant(
         0.025,
         "share",

@@ -142,6 +142,23 @@ class ConfidenceExpert(Section):
         "the same where the sensors lie on each other",
         "0.007 to 0.014 in corridors; at least 0.042 of 23 right answers on real scans",
     )
+    near_sensors: float = constant(
+        5.0,
+        "voxels",
+        (0, 1000),
+        "sensors closer than this may match by their patterns, where a rival fits as well",
+    )
+    near_sensors_rival: float = constant(
+        0.35,
+        "ratio",
+        (0, 100),
+        "of the rival's score by the surfaces to the answer's, from which on that is ambiguous",
+        "of 21 wrong answers in generated car parks, rooms and pipe racks 0.37 to 1.14; of 44 right ones on real scans "
+        "0.27 at most where the rival's overlap is above 0.7",
+    )
+    near_sensors_overlap: float = constant(
+        0.7, "share", (0, 1), "of the source on the target under that rival"
+    )
     least_matches: int = constant(
         6, "matches", (0, 1000), "that must agree with an ok answer", f"{_REAL_PAIRS}: at least 12"
     )

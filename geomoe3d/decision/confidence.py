@@ -85,6 +85,14 @@ def judge(
             slides += "; the sensors lie on each other, so what matches may be their own pattern"
         notes.insert(0, slides)
         return Judgement("ambiguous", tuple(notes), min(confidence, limits.most_sliding))
+    if _may_be_the_pattern(evidence, rival, information):
+        notes.insert(
+            0,
+            "the transform lays the sensors on each other, where what matches may be their own pattern, and a clearly "
+            "different one fits nearly as well; see the alternative: the scans may show repeated or symmetric "
+            "structure",
+        )
+        return Judgement("ambiguous", tuple(notes), min(confidence, limits.most_doubted))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
     alone = confidence_score(evidence, limits.unrivalled_lead, support, information, prior=config.prior)
     # What the clouds like alike is ambiguous unless the network makes the answer sure: by how much it prefers one
@@ -109,6 +117,17 @@ def judge(
         )
         return Judgement("low_confidence", (*notes, low), confidence, low)
     return Judgement("ok", tuple(notes), confidence)
+
+
+def _may_be_the_pattern(evidence: Evidence, rival: Hypothesis | None, information: Information) -> bool:
+    """Whether an answer lays sensor on sensor, which makes any place look like any other, and has a rival that most of
+    the source lies on as well."""
+    limits = expert().confidence
+    if rival is None or information.sensors_apart >= limits.near_sensors:
+        return False
+    other = evidence_of(rival)
+    fits = other.surface_score >= limits.near_sensors_rival * evidence.surface_score
+    return fits and other.overlap >= limits.near_sensors_overlap
 
 
 def _said_below(confidence: float, limit: float) -> str:

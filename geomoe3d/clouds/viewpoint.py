@@ -17,7 +17,7 @@ from geomoe3d.config import expert
 from geomoe3d.errors import ConfigError, InputError
 from geomoe3d.geometry.columns import bounds
 from geomoe3d.geometry.draws import drawn_rows
-from geomoe3d.types import BoolArray, FloatArray, PointCloud, PreparedCloud
+from geomoe3d.types import BoolArray, FloatArray, IntArray, PointCloud, PreparedCloud
 
 Sensors = tuple[ArrayLike | Literal["none"] | None, ArrayLike | Literal["none"] | None]
 """Where the sensors of source and target stood, as far as the user says; see `with_sensors`."""
@@ -184,16 +184,16 @@ def _thinning(cloud: PointCloud) -> float:
     _, first, count = np.unique(voxel_keys(points, cell), return_index=True, return_counts=True)
     if len(count) < 3:
         return 0.0
-    ranks = [_ranks(values) for values in (count, np.linalg.norm(points[first] + cloud.origin, axis=1))]
-    spread = float(np.prod([np.std(rank) for rank in ranks]))
-    return float(np.cov(*ranks, bias=True)[0, 1]) / spread if spread > 0 else 0.0
+    full, far = _ranks(count), _ranks(np.linalg.norm(points[first] + cloud.origin, axis=1))
+    spread = float(np.linalg.norm(full) * np.linalg.norm(far))
+    return float(full @ far) / spread if spread > 0 else 0.0
 
 
-def _ranks(values: FloatArray) -> FloatArray:
-    """Ranks of values (n,); equal ones share the mean of theirs."""
+def _ranks(values: FloatArray | IntArray) -> FloatArray:
+    """Ranks of values (n,) from the middle one; equal ones share the mean of theirs."""
     _, which, count = np.unique(values, return_inverse=True, return_counts=True)
-    last = np.cumsum(count)
-    found: FloatArray = (last - (count - 1) / 2.0)[which]
+    ranks = np.cumsum(count) - (count - 1) / 2.0
+    found: FloatArray = ranks[which] - (len(values) + 1) / 2.0
     return found
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -364,9 +364,26 @@ class RegistrationResult:
             data["reasons"] = tuple(data["reasons"])
             if data.get("accuracy") is not None:
                 data["accuracy"] = Accuracy(**data["accuracy"])
-            return cls(**data)
+            found = cls(**data)
+            _check_consistent(found)
+            return found
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"this text is not a registration result: {error!r}") from None
+
+
+def _check_consistent(result: RegistrationResult) -> None:
+    """Raises ValueError: a result as nothing here writes it, changed by hand or damaged."""
+    if result.status not in get_args(Status):
+        raise ValueError(f"status '{result.status}' is none of {', '.join(get_args(Status))}")
+    if not 0 <= result.confidence <= 1:
+        raise ValueError(f"confidence {result.confidence} is not in [0, 1]")
+    T = result.T_target_source
+    if result.status == "failed" and np.isnan(T).all():
+        return
+    R = T[:3, :3] / result.scale
+    rigid = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and np.linalg.det(R) > 0
+    if not rigid or not np.array_equal(T[3], [0, 0, 0, 1]):
+        raise ValueError("T_target_source is no rotation and translation (times scale)")
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:

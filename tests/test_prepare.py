@@ -351,10 +351,11 @@ def test_spacing_equals_brute_force_and_ignores_thinning() -> None:
     points = corner(np.random.default_rng(18), 3000)
     expected = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
     assert typical_spacing(points) == pytest.approx(expected, rel=0.05)
+    assert typical_spacing(np.repeat(points, 3, axis=0)) == pytest.approx(expected, rel=0.1)
     dense = corner(np.random.default_rng(19), 300_000)
     expected = np.median(cKDTree(dense).query(dense[::50], k=2)[0][:, 1])
     assert typical_spacing(dense) == pytest.approx(expected, rel=0.1)
-    assert typical_spacing(np.repeat(points, 2, axis=0)) == 0
+    assert typical_spacing(np.ones((5, 3))) == 0
 
 
 def test_millimetres_against_metres_are_noticed_from_both_sides() -> None:
@@ -376,3 +377,13 @@ def test_rows_sorted_by_sixteen_bits_are_those_of_a_stable_sort(bits: int) -> No
     keys = np.random.default_rng(bits).integers(0, 2**bits, 3000)
     keys = np.concatenate([keys, keys[::2]])
     np.testing.assert_array_equal(sorted_rows(keys), np.argsort(keys, kind="stable"))
+
+
+@pytest.mark.parametrize("times", [2, 3, 6])
+def test_rows_written_several_times_leave_the_voxel_size(times: int) -> None:
+    """A goal of half the rows was beyond what so few places can fill, and the size ran to zero."""
+    points = np.random.default_rng(0).uniform(0, 1, (2500, 3)) * [4, 3, 0.01]
+    once, often = PointCloud(points), PointCloud(np.repeat(points, times, axis=0))
+    assert choose_voxel_size(often, often, 3500) == pytest.approx(
+        choose_voxel_size(once, once, 3500), rel=0.15
+    )

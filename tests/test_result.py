@@ -84,9 +84,25 @@ def test_json_keeps_every_bit(seed: int) -> None:
 
 @pytest.mark.parametrize("value", [-0.0, 5e-324, 1.7976931348623157e308, 1 / 3, 583394.1234567891])
 def test_json_keeps_peculiar_numbers(value: float) -> None:
-    T = np.full((4, 4), value)
+    T = np.eye(4)
+    T[:3, 3] = value
     again = RegistrationResult.from_json(result(T_target_source=T).to_json())
     assert again.T_target_source.tobytes() == T.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"status": "great"}, "status 'great' is none of ok"),
+        ({"confidence": 7.0}, "confidence 7.0"),
+        ({"T_target_source": np.full((4, 4), np.nan)}, "no rotation and translation"),
+        ({"T_target_source": np.diag([1.0, 1, -1, 1])}, "no rotation and translation"),
+        ({"T_target_source": np.diag([1.0, 1, 1, 5])}, "no rotation and translation"),
+    ],
+)
+def test_json_that_was_changed_by_hand_is_refused(changed: dict, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        RegistrationResult.from_json(result(**changed).to_json())
 
 
 def test_json_keeps_a_result_without_transform_or_alternative() -> None:

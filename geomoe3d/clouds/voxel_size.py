@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geomoe3d.clouds.voxel_grid import by_voxel, num_different, voxel_keys, voxel_means
+from geomoe3d.clouds.voxel_grid import by_voxel, drop_duplicates, num_different, voxel_keys, voxel_means
 from geomoe3d.config import expert
 from geomoe3d.geometry.columns import extents, in_cache
 from geomoe3d.geometry.draws import OFF_ROUND, mixed
@@ -92,7 +92,8 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     search that stops when it is close enough would end elsewhere when one point moves to another voxel. For the same
     reason a voxel that holds next to nothing counts in part.
     """
-    sample = points[:: max(1, len(points) // expert().preparation.extent_sample)]
+    # Rows written several times fill no more voxels than one.
+    sample, _ = drop_duplicates(points[:: max(1, len(points) // expert().preparation.extent_sample)])
     extent = robust_extent(points)
     # A small cloud cannot fill the voxels asked for; half its points is what a grid can still even out.
     goal = min(num_points, max(len(sample) // 2, 1))
@@ -145,7 +146,7 @@ def _surface_variation(points: FloatArray, voxel_size: float, count: int) -> flo
 
 
 def typical_spacing(points: FloatArray) -> float:
-    """Distance from a point to its nearest other, mean of the middle half, cloud units; 0 where most points coincide.
+    """Distance from a point to its nearest other place, mean of the middle half, cloud units; 0 of a single place.
 
     Estimated on about 2,000 points inside the central part of the cloud that holds about 8,000. (A median would
     jump where the distances form clusters, as those of points on a grid do.)
@@ -167,7 +168,10 @@ def typical_spacing(points: FloatArray) -> float:
         points, queries = points[central], points[central[asked]]
     else:
         queries = points[:: max(1, len(points) // known.spacing_asked)]
-    tree = small_gicp.KdTree(small_gicp.PointCloud(points), num_threads=1)
+    places, _ = drop_duplicates(points)
+    if len(places) < 2:
+        return 0.0
+    tree = small_gicp.KdTree(small_gicp.PointCloud(places), num_threads=1)
     nearest = np.sqrt(np.sort(tree.batch_knn_search(queries, 2)[1][:, 1]))
     quarter = len(nearest) // 4
     return float(nearest[quarter : len(nearest) - quarter].mean())

@@ -5,7 +5,6 @@ For correspondences without clouds there is `geomoe3d.correspondence_registratio
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import replace
@@ -14,8 +13,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomoe3d.clouds.io import load_points
-from geomoe3d.clouds.loading import without_missing
+from geomoe3d.clouds.loading import load_both, without_missing
 from geomoe3d.clouds.order import in_order
 from geomoe3d.clouds.prepare import check_cloud
 from geomoe3d.clouds.viewpoint import Sensors, with_sensors
@@ -32,9 +30,8 @@ from geomoe3d.geometry.se3 import check_motion, inverse
 from geomoe3d.line import Line
 from geomoe3d.pipeline import Pipeline, resolved, with_weights
 from geomoe3d.result import RegistrationResult
-from geomoe3d.runtime.threads import each
 from geomoe3d.runtime.timing import Progress, StageClock
-from geomoe3d.types import FloatArray, PointCloud
+from geomoe3d.types import FloatArray
 
 
 class Registrar:
@@ -109,7 +106,11 @@ class Registrar:
         """
         if on_error not in ("raise", "return"):
             raise InputError(f"on_error is '{on_error}'; choose raise or return")
-        for source, target in pairs:
+        for number, pair in enumerate(pairs, start=1):
+            try:
+                source, target = () if isinstance(pair, (str, bytes)) else pair
+            except (TypeError, ValueError):
+                raise InputError(f"pair {number} must be (source, target), found {pair!r:.60}") from None
             try:
                 yield self.register(source, target)
             except InputError as error:
@@ -150,7 +151,7 @@ class Registrar:
         if initial is not None:
             _check_guess_is_wanted(config)
         clock("load")
-        loaded = with_sensors(_load_both(source, target, seed), sensors, config.preparation.viewpoint)
+        loaded = with_sensors(load_both(source, target, seed), sensors, config.preparation.viewpoint)
         clouds = without_missing(loaded[0]), without_missing(loaded[1])
         for cloud in clouds:
             check_cloud(cloud)
@@ -245,17 +246,3 @@ def _check_guess_is_wanted(config: RegistrationConfig) -> None:
             "a first guess is weighed against the hypotheses by scorers, but scoring.scorers is empty; leave "
             "one of the two out"
         )
-
-
-def _load_both(source: Any, target: Any, seed: int) -> tuple[PointCloud, PointCloud]:
-    """Side by side what is in memory; not all that reads files can be called by two threads."""
-    both = (source, "source"), (target, "target")
-    if any(isinstance(data, (str, os.PathLike)) for data, _ in both):
-        return _load(source, "source", seed), _load(target, "target", seed)
-    first, second = each(lambda one: _load(*one, seed), both)
-    return first, second
-
-
-def _load(data: Any, role: str, seed: int) -> PointCloud:
-    named = isinstance(data, (str, os.PathLike, PointCloud))
-    return load_points(data, seed=seed, name=None if named else role)

@@ -239,6 +239,7 @@ def test_the_command_places_and_exits_with_three(scanned_room, tmp_path):
         ("a.npy", {}, "at least 2 scans"),
         (Path("none"), {}, "no file or folder 'none'"),
         (None, {}, "scans must be paths of files or of folders, found None"),
+        ([], {}, "no scans are given"),
         (np.zeros((5, 3)), {}, "scan 1 must be the path .* found ndarray of shape .3,."),
         (["a.npy", np.zeros((5, 3))], {}, "scan 2 must be the path .* found ndarray of shape .5, 3."),
         (["a.npy", "b.npy"], {}, "fewer than 2 scans can be used"),

@@ -252,6 +252,9 @@ def test_register_many_goes_on_when_asked_to(files):
         list(Registrar(CONFIG).register_many(pairs))
     with pytest.raises(geomoe3d.InputError, match="raise or return"):
         next(Registrar(CONFIG).register_many(pairs, on_error="skip"))
+    for wrong in ("ab", (files[0],), (*files[:2], files[0]), 7):
+        with pytest.raises(geomoe3d.InputError, match=r"pair 1 must be \(source, target\)"):
+            list(Registrar(CONFIG).register_many([wrong], on_error="return"))
 
 
 def test_threads_of_one_process_give_the_same_answers(result, files):

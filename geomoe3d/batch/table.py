@@ -81,7 +81,7 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise FormatError(f"'{path}' is no text in UTF-8; save the table as CSV") from None
+        raise FormatError(f"'{path}' is no text in UTF-8; save the table as 'CSV UTF-8'") from None
     except OSError as error:
         raise cannot_read(error, f"cannot read '{path}': {error.strerror}") from None
     head = text.partition("\n")[0]

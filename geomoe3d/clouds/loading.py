@@ -47,6 +47,7 @@ from geomoe3d.errors import (
 )
 from geomoe3d.geometry.columns import finite_rows
 from geomoe3d.runtime.home import ensure_home
+from geomoe3d.runtime.threads import each
 from geomoe3d.types import FloatArray, PointCloud
 
 READABLE_SUFFIXES = tuple(READERS)
@@ -129,6 +130,22 @@ def _checked(cloud: PointCloud) -> PointCloud:
     return replace(
         cloud, points=raw.points, normals=raw.normals, colors=raw.colors, num_non_finite=num_non_finite
     )
+
+
+def load_both(source: Any, target: Any, seed: int) -> tuple[PointCloud, PointCloud]:
+    """Both clouds of a pair as `load_points` gives them, with its errors; side by side what is in memory, since not all
+    that reads files can be called by two threads."""
+
+    def load(data: Any, role: str) -> PointCloud:
+        return load_points(
+            data, seed=seed, name=None if _is_path(data) or isinstance(data, PointCloud) else role
+        )
+
+    both = (source, "source"), (target, "target")
+    if any(_is_path(data) for data, _ in both):
+        return load(*both[0]), load(*both[1])
+    first, second = each(lambda one: load(*one), both)
+    return first, second
 
 
 def describe(data: Any) -> str:

@@ -46,6 +46,10 @@ def as_paths(
     if isinstance(scans, (bytes, Mapping)) or not isinstance(scans, Iterable):
         raise InputError(f"scans must be paths of files or of folders, found {kind_of(scans)}")
     paths = list(scans)
+    if not paths:
+        raise InputError(
+            "no scans are given; a model needs the paths of at least two, or of a folder with them"
+        )
     for number, path in enumerate(paths, start=1):
         if not isinstance(path, (str, os.PathLike)):
             raise InputError(

@@ -186,10 +186,16 @@ def test_new_poses_of_known_clouds_move_them_and_missing_ones_are_refused(two_cl
     assert middle("all.map")[0] == pytest.approx(6.5, abs=0.1)
     poses(4.0)
     assert ask(*words, "--poses", "poses.tum") == ExitCode.OK
-    assert "'two.npy' is in the map already, 4 and 0 deg from where it is put now" in capfd.readouterr().err
+    assert (
+        "'two.npy' is in the map already, at a pose shifted by 4 and turned by 0 deg"
+        in capfd.readouterr().err
+    )
     assert middle("all.map")[0] == pytest.approx(8.5, abs=0.1)
     assert ask(*words) == ExitCode.BAD_INPUT
-    assert "'one.npy' is in the map already, 5 and 0 deg from where it is put now" in capfd.readouterr().err
+    assert (
+        "'one.npy' is in the map already, at a pose shifted by 5 and turned by 0 deg"
+        in capfd.readouterr().err
+    )
     assert middle("all.map")[0] == pytest.approx(8.5, abs=0.1)
 
 

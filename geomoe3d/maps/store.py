@@ -64,7 +64,7 @@ class Source:
             own = np.eye(4) if self.T_map_cloud is None else np.array(self.T_map_cloud)
             if not np.allclose(own, T, rtol=1e-9, atol=1e-9):
                 shift, turn = motions_apart(own, T, np.zeros(3))
-                off = f"{shift:.3g} and {turn:.3g} deg from where it is put now"
+                off = f"at a pose shifted by {shift:.3g} and turned by {turn:.3g} deg"
                 what = f"is in the map already, {off}; give the pose it had, or"
         elif path and self.path == path:
             what = "has changed since it was read into the map;"

@@ -3,22 +3,27 @@
 Place: after grouping. Walls and floors of a mirrored scan lie on those of the others, and then many doubtful pairs
 agree on a place for it; but none of them is sure. So parts of the model that nothing sure ties to the rest are looked
 at again, by a few of their pairs, and asked what one pair alone is asked: whether they fit clearly better mirrored, or
-in another unit. Cost: three pairs for each such part, none in a model that sure pairs hold together.
+in another unit. Cost: three pairs for each such part, up to a limit in all, none in a model that sure pairs hold
+together.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
+from geomoe3d.batch.folder import remove_batch
 from geomoe3d.batch.store import Outcome
 from geomoe3d.config import RegistrationConfig, build_config, expert
 from geomoe3d.decision.causes import MIRRORED
 from geomoe3d.decision.scale import UNITS_DIFFER
+from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.proposals import most_similar
 from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import connected_parts
 from geomoe3d.multiway.survey import PairKey, Survey, key_of
+from geomoe3d.runtime.words import counted
 
 CHECKS_FOLDER = "checks"
 
@@ -33,14 +38,55 @@ def find_faults(survey: Survey, groups: Sequence[Group], edges: Sequence[Edge]) 
     """
     parts = loose_parts(range(len(survey.scans)), groups)
     asked = {part: _asked(survey, part, edges) for part in parts[1:]}
-    wanted = sorted({pair for pairs in asked.values() for pair in pairs})
-    checks = survey.register_apart(
-        wanted[: expert().many_pairs.most_checked], of_checks(survey.config), CHECKS_FOLDER
-    )
+    most = expert().many_pairs.most_checked
+    wanted, left = shared_out(asked, most)
+    if left:
+        names = ", ".join(survey.scans[part[0]].name for part in left[:5])
+        survey.say(
+            f"not asked about mirrored axes and units: {counted(len(left), 'part')} of the {len(asked)} that nothing "
+            f"sure ties to the rest, those of {names}{', ...' * (len(left) > 5)}; {counted(most, 'pair')} in all "
+            "are looked at again (expert.many_pairs.most_checked)"
+        )
+    checks = survey.register_apart(sorted(wanted), of_checks(survey.config), CHECKS_FOLDER)
     found = mirrored_scans(asked, checks)
     kept = {id(edge.T_target_source) for group in groups for edge in group.edges}
     holding = [e for e in edges if id(e.T_target_source) in kept]
     return {**found, **scans_of_other_units({**survey.outcomes, **checks}, holding)}
+
+
+def forget_checks(survey: Survey) -> None:
+    """Delete the pairs that an earlier model looked at again; where that cannot be, it is said."""
+    try:
+        remove_batch(survey.store.folder / CHECKS_FOLDER)
+    except GeoMoE3DError as error:
+        survey.say(f"pairs that an earlier model looked at again could not be deleted: {error}")
+
+
+def shared_out(
+    asked: Mapping[tuple[int, ...], Sequence[PairKey]], most: int
+) -> tuple[set[PairKey], list[tuple[int, ...]]]:
+    """So many pairs at most: of every part as many as a verdict needs, two or its only one, then the others.
+
+    Args:
+        asked: pairs by part.
+        most: of all pairs.
+
+    Returns:
+        The pairs, and the parts that get too few for a verdict.
+    """
+    wanted: set[PairKey] = set()
+    left = []
+    for part, pairs in asked.items():
+        more = wanted | set(pairs[:2])
+        if len(more) > most:
+            left.append(part)
+        else:
+            wanted = more
+    for part, pairs in asked.items():
+        for pair in pairs[2:] if part not in left else ():
+            if len(wanted) < most:
+                wanted.add(pair)
+    return wanted, left
 
 
 def of_checks(config: RegistrationConfig) -> RegistrationConfig:
@@ -70,7 +116,8 @@ def _asked(survey: Survey, part: tuple[int, ...], edges: Sequence[Edge]) -> list
 def mirrored_scans(
     asked: Mapping[tuple[int, ...], Sequence[PairKey]], checks: Mapping[PairKey, Outcome]
 ) -> dict[int, str]:
-    """Scans of the parts of which two pairs at least, and most, fit clearly better mirrored.
+    """Scans of the parts of which two pairs at least, and most, fit clearly better mirrored; one, where a part has
+    no other.
 
     Args:
         asked: pairs by part.
@@ -81,7 +128,7 @@ def mirrored_scans(
         told = [checks[pair] for pair in pairs if pair in checks]
         said = [sentence for outcome in told if (sentence := _said(outcome, MIRRORED))]
         against = sum(outcome.status == "ok" for outcome in told)
-        if len(said) > max(against, 1 if len(told) > 1 else 0):
+        if len(said) > max(against, 1 if len(pairs) > 1 else 0):
             text = (
                 f"{MIRRORED}: {len(said)} of {len(told)} pairs fit clearly better with one of the two scans mirrored; "
                 "if the axes of this one are left-handed (often two are exchanged), bring them to right-handed ones"
@@ -91,19 +138,28 @@ def mirrored_scans(
 
 
 def scans_of_other_units(outcomes: Mapping[PairKey, Outcome], holding: Sequence[Edge]) -> dict[int, str]:
-    """Scans that more pairs say to be of another unit than hold them in the model.
+    """Scans that more pairs say to be of another unit than hold them in the model, those already named left aside.
 
     Args:
         outcomes: of all pairs.
         holding: edges near the final poses.
     """
-    said: dict[int, list[str]] = {}
-    for pair, outcome in outcomes.items():
-        sentence = _said(outcome, UNITS_DIFFER)
-        for scan in pair if sentence else ():
-            said.setdefault(scan, []).append(sentence)
-    held = {scan: sum(scan in (e.source, e.target) for e in holding) for scan in said}
-    return {scan: told[0] for scan, told in said.items() if len(told) > held[scan]}
+    said = {
+        pair: sentence for pair, outcome in outcomes.items() if (sentence := _said(outcome, UNITS_DIFFER))
+    }
+    found: dict[int, str] = {}
+    while said:
+        # Both scans of a pair are said to differ. The worst is named first, and what it said of others then goes.
+        told = Counter(scan for pair in said for scan in pair)
+        held = Counter(scan for edge in holding for scan in (edge.source, edge.target))
+        most = max(told[scan] - held[scan] for scan in told)
+        if most <= 0:
+            break
+        worst = {scan for scan in told if told[scan] - held[scan] == most}  # alike: nothing tells which it is
+        found |= {scan: next(text for pair, text in said.items() if scan in pair) for scan in worst}
+        said = {pair: text for pair, text in said.items() if not worst & set(pair)}
+        holding = [edge for edge in holding if not worst & {edge.source, edge.target}]
+    return found
 
 
 def _said(outcome: Outcome, words: str) -> str:

@@ -37,7 +37,7 @@ def describe_model(
     placed = [group for group in groups if len(group.poses) > 1]
     home = {scan: group for group in placed for scan in group.poses}
     tree = spanning_tree([edge for group in placed for edge in group.edges])
-    told = [(edge, _report(survey, edge, home, tree)) for edge in edges]
+    reports = [(edge, _report(survey, edge, home, tree)) for edge in edges]
     made = []
     for group in placed:
         reference, poses = file_poses(group.poses, survey.scans, origins)
@@ -46,7 +46,9 @@ def describe_model(
             for loop in find_loops(group.poses, edges, survey.shapes, survey.voxel_size)
         )
         elsewhere = [
-            report for edge, report in told if report.source in poses and _is_elsewhere(survey, edge, report)
+            report
+            for edge, report in reports
+            if report.source in poses and _is_elsewhere(survey, edge, report)
         ]
         elsewhere.sort(key=lambda report: -report.confidence)
         made.append(
@@ -61,7 +63,7 @@ def describe_model(
         tuple(survey.scans),
         tuple(made),
         unplaced,
-        tuple(report for _, report in told),
+        tuple(report for _, report in reports),
         len(survey.outcomes) + len(survey.map_edges),
         {},
         {names[k]: told for k, told in faults.items() if k in home},

@@ -25,7 +25,7 @@ from geomoe3d.multiway.assembly import Assembly
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO as ALL_PAIRS_UP_TO
 from geomoe3d.multiway.defaults import MOST_ROUNDS as MOST_ROUNDS
 from geomoe3d.multiway.defaults import NEIGHBORS as NEIGHBORS
-from geomoe3d.multiway.faults import find_faults
+from geomoe3d.multiway.faults import find_faults, forget_checks
 from geomoe3d.multiway.initial import InitialPoses, read_poses
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.pose_graph import Library, require_gtsam
@@ -149,6 +149,7 @@ def register_scans(
     store.begin()
     if fresh:
         remove_model(folder)
+        forget_checks(survey)
     clock("register pairs")
     everything = pairs == "all" or (pairs == "auto" and len(found) <= ALL_PAIRS_UP_TO)
     survey.register(survey.first_pairs(everything, neighbors))

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from geomoe3d.clouds.voxel_size import bounded_voxel_size, robust_extent
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.scale import likely_unit_ratio
 from geomoe3d.decision.similarity import scaled_cloud
-from geomoe3d.errors import GeoMoE3DError, InputError
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.alignment import Surface
 from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
@@ -35,6 +36,7 @@ from geomoe3d.multiway.scans import Scan, natural_key
 from geomoe3d.registration import Registrar
 from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
+from geomoe3d.runtime.words import counted
 from geomoe3d.types import Float32Array, FloatArray, PointCloud
 
 PairKey = tuple[int, int]
@@ -66,8 +68,8 @@ class Survey:
         shapes: of every scan, where its points lie in local coordinates; of an unusable one all zeros.
         surfaces: voxel points and normals (N, 3) in local coordinates, by number, of the usable scans.
         overlaps: predicts how much two usable scans overlap.
-        similarity: (K, K) cosine of the descriptions of the scans as wholes; -inf where one is unusable, and
-            between a scan and itself.
+        similarity: (K, K) cosine of the descriptions of the scans as wholes, of an unusable one in the unit that
+            makes it as large as the others; -inf where one has no description, and between a scan and itself.
         outcomes: what became of every pair asked for so far, with motions in file coordinates.
         edges: those of them that gave a transform, with motions (4, 4) in local coordinates.
         map_edges: edges between scans that local maps about them gave, by the pair's id.
@@ -298,17 +300,23 @@ class Survey:
     def register_apart(
         self, pairs: list[PairKey], config: RegistrationConfig, place: str
     ) -> dict[PairKey, Outcome]:
-        """Outcomes of pairs by another configuration, kept in a folder of their own beside the others."""
+        """Outcomes of pairs by another configuration, kept in a folder of their own beside the others.
+
+        Where that folder cannot be used this is said, and there are none: the model does not depend on them.
+        """
         if not pairs:
             return {}
-        folder = self.store.folder / place
-        try:
-            store = BatchStore(folder, config)
-        except InputError:  # of an earlier model, which this one replaces
-            store = BatchStore(folder, config, fresh=True)
         rows = {pair: self._row(pair) for pair in pairs}
-        records, _ = work(list(rows.values()), store, config, self.labour, progress=False, say=self.say)
-        return {pair: store.outcome(records[row.id]) for pair, row in rows.items()}
+        try:
+            store = _replacing_store(self.store.folder / place, config)
+            records, _ = work(list(rows.values()), store, config, self.labour, progress=False, say=self.say)
+            return {pair: store.outcome(records[row.id]) for pair, row in rows.items()}
+        except GeoMoE3DError as error:
+            self.say(
+                f"{counted(len(rows), 'doubtful pair')} could not be looked at again, so scans that are mirrored or "
+                f"in another unit may go unnamed: {error}"
+            )
+            return {}
 
     def _count(self) -> Callable[[int, int], None] | None:
         """Progress of one round, told as that of all pairs so far proposed."""
@@ -342,6 +350,17 @@ class Survey:
         """(3,) where the sensor of a scan stood, or zero where that is not known; local coordinates."""
         known = scan in self.surfaces and self.surfaces[scan].signed
         return self.shapes[scan].sensor if known else np.zeros(3)
+
+
+def _replacing_store(folder: Path, config: RegistrationConfig) -> BatchStore:
+    """A store that begins anew where the folder holds pairs of another configuration. Raises FormatError: its files
+    are damaged; else as `BatchStore`."""
+    try:
+        return BatchStore(folder, config)
+    except FormatError:
+        raise
+    except InputError:  # of an earlier model, which this one replaces
+        return BatchStore(folder, config, fresh=True)
 
 
 def key_of(a: int, b: int) -> PairKey:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import ConfigError, InputError
+from geomoe3d.line import _on_each_other
 from geomoe3d.types import PointCloud, PreparedCloud
 
 FAR = np.array([500.0, -20.0, 3.0])
@@ -111,3 +114,15 @@ def test_what_is_advised_where_sensors_are_guessed_names_the_verb_that_has_the_o
     (said,) = remarks((points, points[::-1]), (cloud, cloud), 0.1, False, PreparationConfig(), doubtful)
     assert said.index("`geomoe3d register`: --sensor-source") < said.index("`locate`: --sensor X,Y,Z")
     assert "preparation.viewpoint=origin" in said
+
+
+def test_a_look_without_sensors_that_lays_the_believed_ones_on_each_other_is_seen() -> None:
+    T = np.eye(4)
+    T[:3, 3] = [2.0, 0.0, 0.0]
+    look: Any = SimpleNamespace(
+        decision=SimpleNamespace(T_target_source=T), pair=SimpleNamespace(voxel_size=0.1)
+    )
+    here = np.zeros(3)
+    assert _on_each_other((here, np.array([2.3, 0.0, 0.0])), look)
+    assert not _on_each_other((here, np.array([2.6, 0.0, 0.0])), look)
+    assert not _on_each_other(None, look)

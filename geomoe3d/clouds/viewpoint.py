@@ -178,9 +178,9 @@ def _thinning(cloud: PointCloud) -> float:
     """
     known = expert().viewpoint
     points = cloud.points
-    if len(points) > known.thinning_points:
-        points = points[np.random.default_rng(0).choice(len(points), known.thinning_points, replace=False)]
     cell = float(np.linalg.norm(np.subtract(*bounds(points)))) / known.thinning_cells
+    if len(points) > known.thinning_points:  # by place: far finer cells than those that are counted
+        points = points[drawn_rows(points, cell / 1000, known.thinning_points)]
     _, first, count = np.unique(voxel_keys(points, cell), return_index=True, return_counts=True)
     if len(count) < 3:
         return 0.0

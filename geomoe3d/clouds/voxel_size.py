@@ -108,6 +108,9 @@ def _size_for_count(points: FloatArray, num_points: int) -> float:
     while coarse > goal and step < coarsest:
         step, fine, coarse = step + 1, coarse, count(step + 2)
     while fine < goal:
+        # Places written several times, but for rounding, fill no more voxels however small: then half the places.
+        if 2.0 ** (step / 2) < extent / expert().preparation.finest:
+            return _size_for_count(points, max(int(fine) // 2, 1))
         step, fine, coarse = step - 1, count(step - 1), fine
     share = np.log(fine / goal) / np.log(fine / coarse) if fine > coarse else 1.0
     return float(min(2.0 ** ((step + share) / 2), extent))

@@ -29,6 +29,12 @@ class LoadingExpert(Section):
 class PreparationExpert(Section):
     """From points to a grid (`clouds/voxel_size.py`, `clouds/voxel_grid.py`)."""
 
+    finest: float = constant(
+        10_000.0,
+        "cells",
+        (10, 2**20),
+        "of the extent, beyond which a grid that is still not full will not become so",
+    )
     extent_sample: int = constant(
         100_000,
         "points",
@@ -87,7 +93,7 @@ class ViewpointExpert(Section):
         "fragments 0.37 at least, laser scans in rooms 0.22",
     )
     moved_exactly: float = constant(
-        1e-4,
+        0.003,
         "extents",
         (0, 1),
         "any of these three nearer: the cloud was moved there, whatever its points are like",
@@ -97,7 +103,7 @@ class ViewpointExpert(Section):
         "rank correlation",
         (-1, 1),
         "of points in a cell and its distance from the origin, with which a sensor is believed there all the same",
-        "raw scans all around -0.54 to -0.83; thinned, sampled, merged and centred clouds -0.33 at least",
+        "raw scans all around -0.46 to -0.85; thinned ones, depth-camera frames, samples, merged clouds -0.37 at least",
     )
     thinning_cells: float = constant(60.0, "cells", (2, 10_000), "of which the extent has so many")
     thinning_points: int = constant(100_000, "points", (100, 100_000_000), "at most that are counted")

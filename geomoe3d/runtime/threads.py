@@ -48,7 +48,10 @@ def single_blas_thread() -> Iterator[None]:
 
 
 def usable_threads() -> int:
-    """``OMP_NUM_THREADS`` where it is a positive number, as in worker processes, else the process's cores."""
+    """``OMP_NUM_THREADS`` where it is a positive number, as in worker processes, else the process's cores; one inside
+    `each`, whose items have the others."""
+    if getattr(_inside, "busy", False):
+        return 1
     given = os.environ.get(THREADS_VARIABLE, "").split(",")[0].strip()
     if given.isdigit() and int(given) > 0:
         return int(given)
@@ -67,7 +70,7 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     Worth it from about a millisecond per item, spent outside the interpreter (numpy, torch).
     """
     todo = list(items)
-    usable = 1 if getattr(_inside, "busy", False) else usable_threads()
+    usable = usable_threads()
     if min(usable, len(todo)) < 2:
         return [function(item) for item in todo]
     futures: list[Future[Result]] = [Future() for _ in todo]
@@ -106,7 +109,7 @@ def beside(first: Callable[[], Result], second: Callable[[], Other]) -> tuple[Re
     For a first one that keeps one thread busy most of the time; unlike an item of `each` it may itself go side by side.
     An exception of the first one comes before one of the second. BLAS and contexts are as in `each`.
     """
-    if getattr(_inside, "busy", False) or usable_threads() < 2:
+    if usable_threads() < 2:
         return first(), second()
 
     def work() -> Other:

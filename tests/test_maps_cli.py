@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from generated_buildings import AWAY, GRID, UTM, scanned, shift
 
 from geomoe3d import Map
+from geomoe3d.cli import index
 from geomoe3d.cli.errors import ExitCode, run
 from geomoe3d.cli.main import geomoe3d as program
 
@@ -221,3 +224,28 @@ def test_what_can_be_no_map_is_named(tmp_path, monkeypatch, capfd):
         assert ask("index", f"{name}.npy", f"{name}.map") == ExitCode.BAD_INPUT
         assert said in capfd.readouterr().err
         assert not Path(f"{name}.map").exists()
+
+
+@pytest.mark.parametrize("more", [(), ("--fresh",)])
+def test_a_map_that_is_made_anew_takes_the_place_of_the_old_one_only_when_complete(
+    two_clouds, monkeypatch, capfd, more
+):
+    minutes = itertools.count(0.0, 61.0)
+    monkeypatch.setattr(index, "time", SimpleNamespace(monotonic=lambda: next(minutes)))
+    words = ("index", "one.npy", "two.npy", "all.map")
+    assert ask(*words) == ExitCode.OK
+    before = Path("all.map").read_bytes()
+    whole = Path("two.npy").read_bytes()
+    np.save("one.npy", np.random.default_rng(5).uniform(0, 3, (4000, 3)))
+    Path("two.npy").write_bytes(whole[:100])
+    assert ask(*words, *more) == ExitCode.BAD_INPUT
+    assert "two.npy" in capfd.readouterr().err
+    assert Path("all.map").read_bytes() == before
+    # Where there was no map, what was read is kept, and the next call goes on.
+    Path("all.map").unlink()
+    assert ask(*words, *more) == ExitCode.BAD_INPUT
+    assert [source.name for source in Map.open("all.map").sources] == ["one.npy"]
+    Path("two.npy").write_bytes(whole)
+    capfd.readouterr()
+    assert ask(*words) == ExitCode.OK
+    assert "2 clouds (1 new)" in capfd.readouterr().out

@@ -63,9 +63,10 @@ def command(
             raise OutputError(f"'{out}' exists and is no map of geomoe3d; remove it, or give another name")
         scans = find_clouds(inputs[:-1])
         where = None if poses is None else read_poses(poses, [scan.name for scan in scans])
-        made = Map.open(out, config=config) if out.exists() and not fresh else Map.empty(config=config)
+        old = out.exists()
+        made = Map.open(out, config=config) if old and not fresh else Map.empty(config=config)
 
-        def with_all(made: Map) -> Map:
+        def with_all(made: Map, *, keep: bool) -> Map:
             kept = time.monotonic()
             for number, scan in enumerate(scans):
                 stage(f"read {Path(scan.path).name}")
@@ -76,24 +77,25 @@ def command(
                     view = find_viewpoints(cloud, cloud, config.preparation.viewpoint)[0]
                     sensor = None if view is None else view + cloud.origin
                     made = made.with_cloud(scan.path, T_map_cloud=where[number], sensor=sensor)
-                # A minute after the last time, what was read so far is written.
-                if time.monotonic() - kept > 60.0:
+                # A minute after the last time, what was read so far is written, where the file loses nothing by it.
+                if keep and time.monotonic() - kept > 60.0:
                     made.save(out, force=True)
                     kept = time.monotonic()
             return made
 
         before, anew = made.sources, ""
         try:
-            made = with_all(made)
+            made = with_all(made, keep=not (old and fresh))
         except StaleMapError as error:
-            # What was given makes all of the map: nothing is lost where it begins anew, but for poses.
+            # What was given makes all of the map: nothing is lost where it begins anew, but for poses. The old map
+            # stays until the new one is complete: a later cloud may be one that cannot be read.
             posed = where is None and any(source.T_map_cloud for source in before)
             if posed or not {source.path for source in before} <= {
                 str(Path(scan.path).resolve()) for scan in scans
             }:
                 raise
             before, anew = (), f"{str(error).split(';')[0]}: all clouds were read anew"
-            made = with_all(Map.empty(config=config))
+            made = with_all(Map.empty(config=config), keep=False)
         doubles = sorted({s.name for s in before} & {s.name for s in made.sources[len(before) :]})
         made.describe(progress=stage)
         stage("write")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -249,3 +250,15 @@ def test_a_map_that_is_made_anew_takes_the_place_of_the_old_one_only_when_comple
     capfd.readouterr()
     assert ask(*words) == ExitCode.OK
     assert "2 clouds (1 new)" in capfd.readouterr().out
+
+
+def test_files_of_equal_content_with_different_poses_are_both_named(two_clouds, capfd):
+    shutil.copy("one.npy", "two.npy")
+    words = ("index", "one.npy", "two.npy", "all.map", "--fresh")
+    assert ask(*words) == ExitCode.OK
+    poses(4.0)
+    capfd.readouterr()
+    assert ask(*words, "--poses", "poses.tum") == ExitCode.BAD_INPUT
+    said = capfd.readouterr().err
+    assert "'two.npy' has the same content as 'one.npy', which is in the map already" in said
+    assert "shifted by 4 and turned by 0 deg against it; leave one of the two out" in said

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -15,6 +17,7 @@ from geomoe3d.clouds.io import load_points, save_points
 from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.maps.pieces import pieces
+from geomoe3d.maps.store import StaleMapError
 
 UTM = np.array([583394.0, 5283100.0, 498.0])
 
@@ -108,3 +111,28 @@ def test_of_an_e57_each_scan_is_read_with_its_sensor(tmp_path):
     floor = voxels.points + voxels.origin - UTM
     floor, towards = floor[:, 2] < 0.05, voxels.towards
     assert (towards[floor, 2] > 0).mean() > 0.9  # the first sensor stood above it
+
+
+def turned(degrees, about):
+    """(4, 4) turn about a vertical axis through a place."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return make_transform(R, about - R @ about)
+
+
+def test_a_cloud_that_lies_millimetres_elsewhere_is_not_the_same_in_grid_coordinates():
+    """Each is told by how far the cloud itself is off, not the zero of its coordinates, 5,000 km away."""
+    cloud = np.random.default_rng(0).uniform(-5, 5, (2000, 3)) + UTM
+    made = Map.empty().with_cloud(cloud, T_map_cloud=np.eye(4))
+    rounded = make_transform(np.eye(3), np.array([0, 1e-9, 0]))
+    assert made.with_cloud(cloud, T_map_cloud=rounded) is made
+    moved = make_transform(np.eye(3), np.array([0, 0.005, 0]))
+    for T, shift, turn in ((moved, 0.005, 0.0), (turned(0.01, cloud.mean(0)), 0.0, 0.01)):
+        with pytest.raises(StaleMapError) as refused:
+            made.with_cloud(cloud, T_map_cloud=T)
+        found = re.search(r"shifted by (\S+) and turned by (\S+) deg", str(refused.value))
+        assert [float(word) for word in found.groups()] == pytest.approx([shift, turn], abs=1e-5)
+    # As a pose at national coordinates may be, where 5 mm are a billionth of the northing.
+    far = Map.empty().with_cloud(cloud - UTM, T_map_cloud=make_transform(np.eye(3), UTM))
+    with pytest.raises(StaleMapError, match=r"shifted by 0\.005 and turned by 0 deg"):
+        far.with_cloud(cloud - UTM, T_map_cloud=make_transform(np.eye(3), UTM + moved[:3, 3]))

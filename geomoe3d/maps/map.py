@@ -152,7 +152,7 @@ class Map:
         T = np.eye(4) if T_map_cloud is None else check_motion(T_map_cloud)
         read = pieces(cloud, _PIECE)
         told = None if sensor is None else np.asarray(sensor, dtype=np.float64)
-        if any(source.holds(read.sha256, read.path, T) for source in self.sources):
+        if any(source.holds(read, T) for source in self.sources):
             return self
         voxels, count = self._voxels, 0
         corners = np.array([np.full(3, np.inf), np.full(3, -np.inf)])

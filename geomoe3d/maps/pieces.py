@@ -43,6 +43,11 @@ class Pieces:
     path: str = ""
     origin: FloatArray | None = None
 
+    def some_place(self) -> FloatArray:
+        """(3,) mean of the first piece, file coordinates; spends that piece. Raises as the reading does."""
+        place: FloatArray = next(self.points)[0].mean(axis=0)
+        return place
+
 
 def pieces(cloud: Any, size: int) -> Pieces:
     """What `load_points` takes, in pieces of at most so many points.

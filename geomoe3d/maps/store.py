@@ -23,11 +23,14 @@ from geomoe3d.errors import FormatError, InputError, MissingFileError, cannot_re
 from geomoe3d.features.learned import LearnedDescriptor
 from geomoe3d.geometry.se3 import motions_apart
 from geomoe3d.maps.level import Level
+from geomoe3d.maps.pieces import Pieces
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 
 VERSION = 4
+_SAME = 1e-8
+"""Poses nearer than that, cloud units and entries of the rotation, are one: rounding goes so far in national grids."""
 _LEVEL = tuple(field.name for field in fields(Level) if field.name not in ("voxel_size", "sensors"))
 _VOXELS = ("origin", "keys", "sums", "counts", "towards", "sensors")
 
@@ -51,29 +54,36 @@ class Source:
     path: str = ""
     T_map_cloud: tuple[tuple[float, ...], ...] | None = None
 
-    def holds(self, sha256: str, path: str, T: FloatArray) -> bool:
-        """Whether it is the cloud of a hash, a path and a transform (4, 4) into the map.
+    def holds(self, read: Pieces, T: FloatArray) -> bool:
+        """Whether it is the cloud that is to be read, with a transform (4, 4) into the map.
 
         Raises:
             StaleMapError: the file has another content by now, or the cloud lies elsewhere.
         """
-        what = ""
-        if not self.path and path:
-            return self.sha256 == sha256  # a version that kept no paths kept no transforms either
-        if self.sha256 == sha256:
-            own = np.eye(4) if self.T_map_cloud is None else np.array(self.T_map_cloud)
-            if not np.allclose(own, T, rtol=1e-9, atol=1e-9):
-                shift, turn = motions_apart(own, T, np.zeros(3))
-                off = f"at a pose shifted by {shift:.3g} and turned by {turn:.3g} deg"
-                what = f"is in the map already, {off}; give the pose it had, or"
-        elif path and self.path == path:
-            what = "has changed since it was read into the map;"
-        if what:
+        again = "index all clouds of the map again (--fresh in the shell), since nothing can be taken out of a map"
+        if not self.path and read.path:
+            return self.sha256 == read.sha256  # a version that kept no paths kept no transforms either
+        if self.sha256 != read.sha256:
+            if read.path and self.path == read.path:
+                raise StaleMapError(f"'{self.name}' has changed since it was read into the map; {again}")
+            return False
+        own = np.eye(4) if self.T_map_cloud is None else np.array(self.T_map_cloud)
+        if np.array_equal(own, T):
+            return True
+        # Told where the cloud is: about the zero of grid coordinates a small turn looks like a long way.
+        shift, turn = motions_apart(own, T, read.some_place())
+        if shift <= _SAME and np.allclose(own[:3, :3], T[:3, :3], rtol=0, atol=_SAME):
+            return True
+        off = f"shifted by {shift:.3g} and turned by {turn:.3g} deg"
+        if self.path == read.path:
             raise StaleMapError(
-                f"'{self.name}' {what} index all clouds of the map again (--fresh in the shell), since nothing can be "
-                "taken out of a map"
+                f"'{self.name}' is in the map already, at a pose {off}; give the pose it had, or {again}"
             )
-        return self.sha256 == sha256
+        one, other = (read.name, self.name) if read.name != self.name else (read.path, self.path)
+        raise StaleMapError(
+            f"'{one}' has the same content as '{other}', which is in the map already, but is {off} against it; leave "
+            f"one of the two out; if '{other}' was only renamed, {again}"
+        )
 
 
 class StaleMapError(InputError):

@@ -20,10 +20,9 @@ from small_scans import SETTINGS, everything, write_table
 
 from geomoe3d import register_pairs
 from geomoe3d.batch.folder import JOURNAL_FILE, RESULTS_FILE
-from geomoe3d.batch.memory import choose_workers, worker_bytes
 from geomoe3d.batch.run import BatchReport
 from geomoe3d.batch.store import Outcome
-from geomoe3d.batch.table import MATRIX_COLUMNS, read_pairs
+from geomoe3d.batch.table import MATRIX_COLUMNS
 from geomoe3d.cli.batch import table as summary
 from geomoe3d.clouds.transform_files import load_transform, save_transform
 from geomoe3d.config import load_config
@@ -298,7 +297,7 @@ def test_beginning_anew_removes_what_the_batch_left_and_nothing_else(scans, copi
     register_pairs(one, copied, config=other, fresh=True)
     left = {path.relative_to(copied).as_posix() for path in everything(copied)}
     kept = {"notes.md", "transforms/ab.npy", "transforms/mine.txt", "transforms/ab before.txt"}
-    assert left == {"run.json", JOURNAL_FILE, RESULTS_FILE, "results.csv", *kept}
+    assert left == {"run.json", JOURNAL_FILE, RESULTS_FILE, "results.csv", "files.json", *kept}
     for path in (*mine, renamed):
         path.unlink()
     (copied / "page.html").write_text("<html>mine</html>")
@@ -330,22 +329,6 @@ def test_two_batches_in_one_folder_are_refused(scans, finished):
         with Journal(out / JOURNAL_FILE), pytest.raises(OutputError, match="another process"):
             register_pairs(scans[0] / "pairs.csv", out, config=CONFIG, fresh=fresh)
     assert (out / JOURNAL_FILE).read_bytes() == before
-
-
-# ---- memory -----------------------------------------------------------------------------------------
-
-
-def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):
-    rows = read_pairs(scans[0] / "pairs.csv")
-    each = worker_bytes(rows)
-    assert 2**28 < each < 2**30
-    monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (3 * each, 4 * each))
-    assert choose_workers(2, each) == (2, int(0.9 * 3 * each) // 2)
-    with pytest.raises(InputError, match=r"at most --workers 2"):
-        choose_workers(3, each)
-    assert choose_workers(None, 100 * each)[0] == 1
-    with pytest.raises(InputError, match="at least 1"):
-        choose_workers(0, each)
 
 
 # ---- the command ------------------------------------------------------------------------------------

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 import time
@@ -13,12 +15,14 @@ import pytest
 from small_scans import SETTINGS, everything, write_table
 
 from geomoe3d import register_pairs
+from geomoe3d.batch import contents
 from geomoe3d.batch.folder import JOURNAL_FILE, RESULTS_FILE
-from geomoe3d.batch.table import MATRIX_COLUMNS, read_pairs
+from geomoe3d.batch.table import MATRIX_COLUMNS, PairRow, read_pairs
 from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.config import load_config
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import inverse
+from geomoe3d.runtime.files import file_hash
 from geomoe3d.runtime.journal import read_journal
 
 CONFIG = load_config(None, SETTINGS)
@@ -48,10 +52,61 @@ def test_a_changed_row_or_file_is_done_again_and_the_rest_is_kept(scans, tmp_pat
     assert (fresh.made, fresh.kept) == (2, 0)
 
 
+def test_a_batch_gone_on_with_reads_only_files_whose_stamp_changed(scans, tmp_path, monkeypatch):
+    for name in "abc":
+        (tmp_path / f"{name}.npy").write_bytes((scans[0] / f"{name}.npy").read_bytes())
+    table, out = tmp_path / "pairs.csv", tmp_path / "out"
+    write_table(table, [("1", "a", "b"), ("2", "a", "c")])
+    read, said = [], []
+
+    def noted(path):
+        read.append(path.stem)
+        return file_hash(path)
+
+    monkeypatch.setattr("geomoe3d.batch.contents.file_hash", noted)
+    monkeypatch.setattr("geomoe3d.batch.run.LONG_READ", 0)
+
+    def called():
+        read.clear()
+        said.clear()
+        contents._hash_of.cache_clear()  # as in a new process
+        report = register_pairs(table, out, config=CONFIG, say=said.append)
+        told = [line for line in said if line.startswith("first reading")]
+        assert len(told) == bool(read) and all(f"{len(read)} new or changed file" in line for line in told)
+        return report.made, sorted(read)
+
+    assert called() == (2, ["a", "b", "c"])
+    assert called() == (0, [])
+    path = tmp_path / "c.npy"
+    points, status = np.load(path), path.stat()
+    np.save(path, points[::-1])
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))  # neither size nor time tell
+    assert called() == (1, ["c"])
+    (out / "files.json").write_text('{"format":"geomoe3d batch files 1","files":{"to')
+    assert called() == (0, ["a", "b", "c"])
+    assert called() == (0, [])
+
+
+def test_a_gltf_is_another_one_when_its_buffer_changes(tmp_path):
+    document = {"asset": {"version": "2.0"}, "buffers": [{"uri": "b%201.bin", "byteLength": 3}]}
+    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    row = PairRow("1", str(tmp_path / "a.gltf"), str(tmp_path / "none.ply"))
+    found = [row.fingerprint(contents.Contents())]
+    for text in ("one", "two", "one"):
+        (tmp_path / "b 1.bin").write_text(text)
+        found.append(row.fingerprint(contents.Contents()))
+    assert found[1] == found[3] and len(set(found)) == 3
+    (tmp_path / "a.gltf").write_text("damaged")
+    assert row.fingerprint(contents.Contents()) not in found
+
+
 def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_path):
     table, out = tmp_path / "many.csv", tmp_path / "out"
     names = [("a", "b"), ("a", "c"), ("b", "c"), ("b", "a"), ("c", "a"), ("c", "b")]
-    lines = [f"{k}-{s}{t},{scans[0] / s}.npy,{scans[0] / t}.npy" for k in range(3) for s, t in names]
+    for k in range(3):  # by other names, since pairs of the same files are one pair
+        for name in "abc":
+            shutil.copy(scans[0] / f"{name}.npy", tmp_path / f"{name}{k}.npy")
+    lines = [f"{k}-{s}{t},{s}{k}.npy,{t}{k}.npy" for k in range(3) for s, t in names]
     table.write_text("\n".join(["id,source,target", *lines]) + "\n")
     command = [sys.executable, "-m", "geomoe3d", "batch", str(table), str(out), *OPTIONS, "--workers", "1"]
     running = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -75,6 +130,7 @@ def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_pa
     [
         ("results.jsonl", {}),
         ("results.csv", {}),
+        ("files.json", {}),
         ("journal.jsonl", {}),
         ("run.json", {}),
         ("page.html", {"page": True}),

@@ -9,6 +9,7 @@ import pytest
 
 from geomoe3d import register_pairs
 from geomoe3d.batch.folder import page_name, transform_name
+from geomoe3d.batch.memory import choose_workers, worker_bytes
 from geomoe3d.batch.run import BatchReport
 from geomoe3d.batch.store import Outcome, results_table
 from geomoe3d.batch.table import MATRIX_COLUMNS, as_rows, read_pairs
@@ -134,3 +135,16 @@ def test_the_summary_names_pairs_whole(tmp_path):
     )
     assert f"  {name}  0.00  error" in table(report)
     assert "\n  b  " in table(report)
+
+
+def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):
+    rows = read_pairs(scans[0] / "pairs.csv")
+    each = worker_bytes(rows)
+    assert 2**28 < each < 2**30
+    monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (3 * each, 4 * each))
+    assert choose_workers(2, each) == (2, int(0.9 * 3 * each) // 2)
+    with pytest.raises(InputError, match=r"at most --workers 2"):
+        choose_workers(3, each)
+    assert choose_workers(None, 100 * each)[0] == 1
+    with pytest.raises(InputError, match="at least 1"):
+        choose_workers(0, each)

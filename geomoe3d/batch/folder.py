@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from geomoe3d.batch.contents import CONTENTS_MARK
 from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.result import RegistrationResult
@@ -21,7 +22,7 @@ from geomoe3d.runtime.journal import Journal
 from geomoe3d.runtime.words import counted
 
 RUN_FILE, JOURNAL_FILE = "run.json", "journal.jsonl"
-RESULTS_FILE, TABLE_FILE = "results.jsonl", "results.csv"
+RESULTS_FILE, TABLE_FILE, CONTENTS_FILE = "results.jsonl", "results.csv", "files.json"
 PAGE_FILE, TRANSFORMS_FOLDER, PAGES_FOLDER = "page.html", "transforms", "pages"
 FORMAT = "geomoe3d batch 1"
 TABLE_HEAD = "id,status,confidence,overlap,"
@@ -144,6 +145,7 @@ def remove_batch(folder: Path) -> None:
         remove([folder / PAGE_FILE])
     # The last one says whose the others are.
     table = [folder / TABLE_FILE] if has_mark(folder / TABLE_FILE, TABLE_HEAD) else []
+    table += [folder / CONTENTS_FILE] if has_mark(folder / CONTENTS_FILE, CONTENTS_MARK) else []
     remove([*table, *(folder / name for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE))])
 
 

@@ -13,6 +13,8 @@ from geomoe3d.runtime.provenance import usable_cores
 from geomoe3d.runtime.words import counted
 
 _BASE_BYTES = 750 * 2**20  # libraries, torch among them, a block of the similarity matrix, described clouds
+LONG_READ = 2**30
+"""Bytes of files from which on it is said that they are read before the first pair."""
 _COMPRESSED = {".laz", ".npz", ".e57", ".glb"}
 
 

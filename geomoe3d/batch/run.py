@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from geomoe3d.batch.contents import Contents
 from geomoe3d.batch.folder import (
     PAGE_FILE,
     PAGE_MARK,
@@ -19,7 +20,7 @@ from geomoe3d.batch.folder import (
     has_mark,
     write_transforms,
 )
-from geomoe3d.batch.memory import choose_workers, gibibytes, worker_bytes
+from geomoe3d.batch.memory import LONG_READ, choose_workers, gibibytes, worker_bytes
 from geomoe3d.batch.store import BatchStore, Outcome
 from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
 from geomoe3d.batch.task import Settings, Task, as_record, make_ready, register_pair
@@ -29,6 +30,7 @@ from geomoe3d.errors import InputError, OutputError
 from geomoe3d.features.cache import CACHE_VARIABLE, default_cache_folder
 from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
+from geomoe3d.runtime.words import counted
 from geomoe3d.runtime.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
 ALL_THAT_FIT = 0
@@ -218,6 +220,19 @@ def register_pairs(
     return BatchReport(folder, outcomes, len(rows) - kept, kept)
 
 
+def _fingerprints(rows: list[PairRow], contents: Contents, say: Callable[[str], None]) -> dict[str, str]:
+    """Fingerprints by id, after saying so where many bytes must be read for them."""
+    count, size = contents.unread(dict.fromkeys(path for row in rows for path in (row.source, row.target)))
+    if size > LONG_READ:
+        say(
+            f"first reading {counted(count, 'new or changed file')} of {gibibytes(size)}, to know them again later"
+        )
+    try:
+        return {row.id: row.fingerprint(contents) for row in rows}
+    finally:
+        contents.save()
+
+
 @shows_progress("pairs")
 def work(
     rows: list[PairRow],
@@ -233,7 +248,6 @@ def work(
 
     Where nothing has been written yet, all that can be refused is before anything is written or removed.
     """
-    wanted = {row.id: row.fingerprint() for row in rows}
     settings = Settings.of(config, labour.cache)
     say = say or (lambda text: None)
     pool: Pool | None = None
@@ -243,6 +257,7 @@ def work(
             try_out(pool, settings)
             store.begin()
         with store.journal() as journal:
+            wanted = _fingerprints(rows, store.contents, say)
             records = store.finished(wanted, with_errors=not retry)
             kept = len(records)
             if progress:

@@ -3,7 +3,7 @@
 ``run.json`` holds the configuration and versions that decide every answer; a folder is only gone on with
 under the same. ``journal.jsonl`` gets one line as each pair is finished. ``results.jsonl`` is written in the
 end, in the order of the table and without times: the same bytes whoever worked on it; ``results.csv`` is the
-same for spreadsheets.
+same for spreadsheets. ``files.json`` keeps the hashes of the files, so that none is read twice for them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from geomoe3d.batch.contents import CONTENTS_MARK, Contents
 from geomoe3d.batch.folder import (
+    CONTENTS_FILE,
     FORMAT,
     JOURNAL_FILE,
     RESULTS_FILE,
@@ -90,6 +92,7 @@ class BatchStore:
     Attributes:
         folder: as given.
         begins: whether nothing of this batch has been written yet.
+        contents: of the files of its pairs, to be asked once it has begun.
 
     Raises:
         InputError: the folder holds a batch of another configuration or version (names what differs), or
@@ -118,8 +121,10 @@ class BatchStore:
         for path in (folder / JOURNAL_FILE, folder / RESULTS_FILE):
             if path.exists() and (stored is None or not path.is_file()):
                 raise InputError(foreign(path))
-        if (folder / TABLE_FILE).exists() and not has_mark(folder / TABLE_FILE, TABLE_HEAD):
-            raise InputError(foreign(folder / TABLE_FILE))
+        for path, mark in ((folder / TABLE_FILE, TABLE_HEAD), (folder / CONTENTS_FILE, CONTENTS_MARK)):
+            if path.exists() and not has_mark(path, mark):
+                raise InputError(foreign(path))
+        self.contents = Contents(folder / CONTENTS_FILE)
         differing = {} if stored is None or fresh else differences(stored, self._identity)
         if differing:
             raise InputError(

@@ -14,16 +14,15 @@ import os
 from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from geomoe3d.batch.contents import Contents
 from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, cannot_read
 from geomoe3d.geometry.se3 import check_motion
-from geomoe3d.runtime.files import file_hash
 from geomoe3d.types import FloatArray
 
 MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
@@ -56,9 +55,9 @@ class PairRow:
         """(4, 4) first guess, or None."""
         return None if self.initial is None else np.array(self.initial).reshape(4, 4)
 
-    def fingerprint(self) -> str:
+    def fingerprint(self, contents: Contents) -> str:
         """Hash of what decides the answer: names and content of both files, and the first guess; not where they lie."""
-        files = [(Path(path).name, _content(path)) for path in (self.source, self.target)]
+        files = [(Path(path).name, contents.of(path)) for path in (self.source, self.target)]
         says = [*files, self.initial]
         return hashlib.sha256(json.dumps(says).encode()).hexdigest()[:16]
 
@@ -245,18 +244,3 @@ def _motion(matrix: Any, where: str) -> tuple[float, ...]:
         return tuple(float(value) for value in check_motion(matrix).ravel())
     except InputError as error:
         raise InputError(f"{where}: the first guess cannot be used: {error}") from None
-
-
-def _content(path: str) -> str | None:
-    """A hash of a file's bytes, None of one that cannot be read."""
-    try:
-        status = Path(path).stat()
-        return _hash_of(path, (status.st_size, status.st_mtime_ns, status.st_ctime_ns))
-    except (OSError, GeoMoE3DError):
-        return None
-
-
-@lru_cache(maxsize=100_000)
-def _hash_of(path: str, stamp: tuple[int, ...]) -> str:
-    """See `file_hash`; read once for each stamp of size and times."""
-    return file_hash(Path(path))

@@ -251,7 +251,7 @@ class Survey:
         """Pairs in the journal whose scans are the same today, wherever they lie."""
         stored = {record.get("fingerprint") for record in read_journal(self.store.folder / JOURNAL_FILE)}
         pairs = [(i, j) for j in self.usable() for i in self.usable() if i < j] if stored else []
-        return {pair for pair in pairs if self._row(pair).fingerprint() in stored}
+        return {pair for pair in pairs if self._row(pair).fingerprint(self.store.contents) in stored}
 
     def _ends(self, pair: PairKey) -> tuple[int, int]:
         """Source and target of a pair: by name, whatever the order in which scans are given."""

@@ -205,6 +205,13 @@ def _resource(path: Path, uri: str) -> bytes:
     return file.read_bytes()
 
 
+def buffer_files(path: Path) -> list[Path]:
+    """The files beside a GLTF in which its buffers lie, there or not. Raises as `read_chunks`, or whatever a damaged
+    document leads to."""
+    uris = [buffer.get("uri", "data:") for buffer in read_chunks(path)[0].get("buffers", ())]
+    return [path.parent / unquote(uri) for uri in uris if not uri.startswith("data:")]
+
+
 def _scenes(content: dict[str, Any]) -> list[dict[str, Any]]:
     """The scenes, or one of all nodes that are nobody's child."""
     nodes = content.get("nodes", [])

@@ -29,7 +29,7 @@ from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 
 VERSION = 4
-_SAME = 1e-8
+_TINY = 1e-8
 """Poses nearer than that, cloud units and entries of the rotation, are one: rounding goes so far in national grids."""
 _LEVEL = tuple(field.name for field in fields(Level) if field.name not in ("voxel_size", "sensors"))
 _VOXELS = ("origin", "keys", "sums", "counts", "towards", "sensors")
@@ -72,7 +72,7 @@ class Source:
             return True
         # Told where the cloud is: about the zero of grid coordinates a small turn looks like a long way.
         shift, turn = motions_apart(own, T, read.some_place())
-        if shift <= _SAME and np.allclose(own[:3, :3], T[:3, :3], rtol=0, atol=_SAME):
+        if shift <= _TINY and np.allclose(own[:3, :3], T[:3, :3], rtol=0, atol=_TINY):
             return True
         off = f"shifted by {shift:.3g} and turned by {turn:.3g} deg"
         if self.path == read.path:

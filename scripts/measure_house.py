@@ -34,7 +34,7 @@ KINDS = {
     ),
     "that an option of a verb sets, named in its help": ("multiway/defaults.py:*",),
     "of memory and time, by which the same answer is had: blocks, chunks, caches": (
-        "*:*BLOCK *:*_AT_ONCE *:*_BLOCK_ENTRIES *:_ROWS *:_PIECE batch/memory.py:*",
+        "*:*BLOCK *:*_AT_ONCE *:*BLOCK_ENTRIES *:_ROWS *:_PIECE batch/memory.py:*",
     ),
     "of a trained network, whose weights hold with them alone, or of a published architecture": (
         "networks/*:* features/learned.py:* features/pyramid.py:*",

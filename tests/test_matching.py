@@ -82,7 +82,7 @@ def test_neighbours_distances_ratios_and_mutuality_equal_brute_force(
 def test_small_blocks_give_the_same(monkeypatch: pytest.MonkeyPatch, entries: int, k: int) -> None:
     source, target = pair(n=70, m=31)
     whole = nearest_features(source.features, target.features, k)
-    monkeypatch.setattr(matching, "_BLOCK_ENTRIES", entries)
+    monkeypatch.setattr(matching, "BLOCK_ENTRIES", entries)
     parts = nearest_features(source.features, target.features, k)
     np.testing.assert_array_equal(parts[0], whole[0])
     np.testing.assert_allclose(parts[1], whole[1], atol=1e-4)
@@ -96,7 +96,7 @@ def test_blocks_stay_within_their_bound(monkeypatch: pytest.MonkeyPatch) -> None
 
     rng = np.random.default_rng(3)
     source, target = unit_features(rng, 3000, 8), unit_features(rng, 2000, 8)
-    monkeypatch.setattr(matching, "_BLOCK_ENTRIES", 100_000)
+    monkeypatch.setattr(matching, "BLOCK_ENTRIES", 100_000)
     tracemalloc.start()
     nearest_features(source, target, 2)
     peak = tracemalloc.get_traced_memory()[1]
@@ -274,7 +274,7 @@ def test_blocks_share_the_best_of_every_column(monkeypatch: pytest.MonkeyPatch) 
     a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
     whole = matching.nearest_features(a, b, 2)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    monkeypatch.setattr(matching, "_BLOCK_ENTRIES", 1000)
+    monkeypatch.setattr(matching, "BLOCK_ENTRIES", 1000)
     parts = matching.nearest_features(a, b, 2)
     for x, y in zip(whole, parts, strict=True):
         np.testing.assert_allclose(x, y, atol=1e-6)
@@ -305,7 +305,7 @@ def test_matches_of_two_kinds_stand_together_once_each() -> None:
 def test_dual_softmax_is_the_product_of_both_softmaxes(step: int, monkeypatch) -> None:
     from geomoe3d.matching import dual_softmax
 
-    monkeypatch.setattr(dual_softmax, "_BLOCK_ENTRIES", step * 40)
+    monkeypatch.setattr(dual_softmax, "BLOCK_ENTRIES", step * 40)
     rng = np.random.default_rng(3)
     a, b = (rng.normal(size=(n, 8)) for n in (30, 40))
     a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))

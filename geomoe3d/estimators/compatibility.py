@@ -15,7 +15,6 @@ from geomoe3d.types import BoolArray, Float32Array, FloatArray, IntArray
 
 BLOCK = 250  # rows of the matrix of all pairs that one thread works on: they stay in its cache
 PAIR_BLOCK = 125  # the same where several such blocks are worked on
-REFIT_BLOCK = 50  # motions that one thread refits
 
 
 def bundle_weights(target: FloatArray) -> Float32Array:

@@ -30,7 +30,6 @@ from geomoe3d.estimators.base import Estimator, check_correspondences, estimator
 from geomoe3d.estimators.compatibility import (
     BLOCK,
     PAIR_BLOCK,
-    REFIT_BLOCK,
     blocks,
     bundle_weights,
     choose_seeds,
@@ -236,7 +235,7 @@ class ConsensusEstimator(Estimator):
                 if not len(moving):
                     break
 
-        each(part, blocks(np.arange(len(R)), REFIT_BLOCK))
+        each(part, blocks(np.arange(len(R)), 50))  # motions that one thread refits
         return R, t
 
     def _distinct_rows(self, R: FloatArray, t: FloatArray, scores: FloatArray, limit: int) -> list[int]:

@@ -11,6 +11,9 @@ from geomoe3d.errors import InputError
 from geomoe3d.parts import Part, Registry
 from geomoe3d.types import Correspondences, Float32Array, PreparedCloud
 
+BLOCK_ENTRIES = 1_000_000
+"""Entries of the similarity matrix that are there at a time."""
+
 
 class Matcher(Part):
     """Pairs points of two clouds whose features are alike; wrong pairs are expected."""

@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomoe3d.matching.base import Matcher, features_of, matcher
+from geomoe3d.matching.base import BLOCK_ENTRIES, Matcher, features_of, matcher
 from geomoe3d.runtime.threads import single_blas_thread
 from geomoe3d.types import Correspondences, Float32Array, IntArray, PreparedCloud
-
-_BLOCK_ENTRIES = 1_000_000
 
 
 @matcher("dual_softmax")
@@ -59,7 +57,7 @@ def best_by_dual_softmax(
     source: Float32Array, target: Float32Array, temperature: float
 ) -> tuple[IntArray, Float32Array]:
     """For every source feature (n, d) the target (m, d) of the highest dual softmax, and the score's logarithm (n,)."""
-    step = max(1, _BLOCK_ENTRIES // len(target))
+    step = max(1, BLOCK_ENTRIES // len(target))
     starts = range(0, len(source), step)
     # Similarities of unit features are at most 1, so that exponentials of what is missing to it never overflow.
     of_columns = np.zeros(len(target))

@@ -14,14 +14,12 @@ import numpy as np
 
 from geomoe3d.config import MatchingConfig
 from geomoe3d.geometry.draws import drawn_rows
-from geomoe3d.matching.base import Matcher, features_of, matcher
+from geomoe3d.matching.base import BLOCK_ENTRIES, Matcher, features_of, matcher
 from geomoe3d.runtime.threads import each, single_blas_thread
 from geomoe3d.types import BoolArray, Correspondences, Float32Array, IntArray, PreparedCloud
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-_BLOCK_ENTRIES = 1_000_000
 
 
 @matcher("one_way", "mutual", "ratio")
@@ -124,7 +122,7 @@ def nearest_features(
     best = np.empty((len(source), k), dtype=np.float32)
     beyond = np.full(len(source), -np.inf, dtype=np.float32)
     column_best = np.full(len(target), -np.inf, dtype=np.float32)
-    step = max(1, _BLOCK_ENTRIES // len(target))
+    step = max(1, BLOCK_ENTRIES // len(target))
     lock = threading.Lock()
 
     def fill(start: int) -> None:

@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 MAX_POINTS = 60_000
-DPI = 100
 
 
 def save_picture(view: RegistrationView, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -76,7 +75,7 @@ def save_picture(view: RegistrationView, path: str | os.PathLike[str], *, force:
         metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(suffix)
         with warnings.catch_warnings():  # a file name in a script the font lacks shows as boxes: enough
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=metadata)
+            figure.savefig(temporary, format=suffix[1:], dpi="figure", metadata=metadata)
 
     write_atomically(path, write, force=force)
 
@@ -90,7 +89,7 @@ def draw_picture(view: RegistrationView, *, fineness: float = 1.0) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(16.0, 14.0), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(16.0, 14.0), dpi=100, facecolor="white")
     drawing = build_drawing(view, max_points=MAX_POINTS)
     rows = figure.add_gridspec(
         3, 1, height_ratios=(1, 1, 1.05), left=0.02, right=0.98, top=0.895, bottom=0.04, hspace=0.16

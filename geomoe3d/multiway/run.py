@@ -177,7 +177,7 @@ def register_scans(
         known, groups = groups, assembly.groups()
         if [group.poses.keys() for group in groups] == [group.poses.keys() for group in known]:
             break
-    clock("look again at what nothing sure ties")
+    clock("check scans that no sure pair holds")
     faults = find_faults(survey, groups, assembly.edges)
     clock("write the model")
     model = describe_model(survey, assembly.edges, folder, groups, faults)

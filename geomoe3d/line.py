@@ -25,13 +25,14 @@ from geomoe3d.decision.causes import Register, differing_units, is_sure, mirrore
 from geomoe3d.decision.choosers import have_margin
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
+from geomoe3d.decision.information import distance_under
 from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
 from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
 from geomoe3d.decision.selection import Selection, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
-from geomoe3d.geometry.se3 import inverse, transform_points
+from geomoe3d.geometry.se3 import inverse
 from geomoe3d.pipeline import Clouds, Pipeline, Places, Sides
 from geomoe3d.runtime.threads import beside, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
@@ -346,5 +347,5 @@ def _on_each_other(places: Places, look: Look) -> bool:
     """Whether an answer lays sensors that are believed to have stood at ``places`` on each other."""
     if places is None:
         return False
-    apart = transform_points(look.decision.T_target_source, places[0][None])[0] - places[1]
-    return float(np.linalg.norm(apart)) < expert().confidence.near_sensors * look.pair.voxel_size
+    apart = distance_under(look.decision.T_target_source, *places)
+    return apart < expert().confidence.near_sensors * look.pair.voxel_size

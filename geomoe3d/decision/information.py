@@ -101,11 +101,16 @@ def _sensors_apart(T_target_source: FloatArray, source: PreparedCloud, target: P
     ):
         places.append((origins[0], origins[1]))
     gaps = [
-        float(np.linalg.norm(transform_points(T_target_source, one[None])[0] - other))
+        distance_under(T_target_source, one, other)
         for one, other in places
         if one is not None and other is not None
     ]
     return min(gaps, default=np.inf) / source.voxel_size
+
+
+def distance_under(T_target_source: FloatArray, source: FloatArray, target: FloatArray) -> float:
+    """Distance of a place (3,) of the source, moved, and one of the target."""
+    return float(np.linalg.norm(transform_points(T_target_source, source[None])[0] - target))
 
 
 def deviations_at(matrix: FloatArray, center: FloatArray, points: FloatArray) -> FloatArray:

@@ -66,6 +66,7 @@ OPTIONAL_MODULES = {
     "pye57": ("pye57>=0.4.11", "E57 files"),
     "cv2": ("opencv-python-headless>=4.9", "two images: relative pose and homography"),
     "simplejpeg": ("simplejpeg>=1.8", "JPEG images"),
+    "h5py": ("h5py>=3.10", "cameras of YFCC100M and SUN3D"),
     "tensorboard": ("tensorboard>=2.16", "curves of a training run in TensorBoard"),
     "kiss_matcher": ("kiss-matcher>=1.0", "comparison with KISS-Matcher"),
 }

@@ -14,7 +14,8 @@ from image_scenes import CAMERA, matches_of, texture
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, InputError, MissingFileError
 from geomoe3d.geometry.homography import weighted_dlt
-from geomoe3d.images.cameras import Camera, rotation_deg
+from geomoe3d.geometry.se3 import rotation_angle_deg, rotation_error_deg
+from geomoe3d.images.cameras import Camera
 from geomoe3d.images.features import detect, match, read_grey
 from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
@@ -56,7 +57,7 @@ def test_the_pose_of_matches_with_wrong_ones_among_them(estimator):
     pixels, true, T = matches_of(wrong=0 if estimator == "eight_point" else 200)
     found = find_pose(pixels, (CAMERA, CAMERA), estimator=estimator, threshold=1.5)
     assert found.status == "ok", found.reasons
-    assert rotation_deg(found.T @ np.linalg.inv(T)) < 0.5
+    assert rotation_error_deg(found.T, T) < 0.5
     assert angle_between(found.t, T[:3, 3]) < 1.5
     assert (found.inliers == true).mean() > (0.85 if estimator == "eight_point" else 0.97)
     assert found.residuals[true].max() < 3 < np.median(found.residuals[~true]) if (~true).any() else True
@@ -76,7 +77,7 @@ def test_a_camera_that_only_turned_or_hardly_moved_is_ambiguous_and_its_rotation
         found = find_pose(pixels, (CAMERA, CAMERA))
         assert found.status == "ambiguous"
         assert "only turned" in found.reasons[0]
-        assert rotation_deg(found.R @ T[:3, :3].T) < 1
+        assert rotation_angle_deg(found.R @ T[:3, :3].T) < 1
 
 
 def test_a_planar_scene_is_ambiguous_and_the_other_pose_is_given():
@@ -85,7 +86,7 @@ def test_a_planar_scene_is_ambiguous_and_the_other_pose_is_given():
     assert found.status == "ambiguous"
     assert "plane" in found.reasons[0]
     poses = [found.T, *found.alternatives]
-    assert min(rotation_deg(pose @ np.linalg.inv(T)) for pose in poses) < 1
+    assert min(rotation_error_deg(pose, T) for pose in poses) < 1
 
 
 def test_unrelated_images_are_never_ok_and_few_matches_fail():

@@ -7,16 +7,20 @@ import struct
 
 import numpy as np
 import pytest
+from image_scenes import write_published
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.errors import FormatError, InputError, MissingFileError
-from geomoe3d.geometry.se3 import inverse, make_transform
-from geomoe3d.images.cameras import relative_pose, rotation_deg
-from geomoe3d.images.scenes import choose_pairs, read_scene
+from geomoe3d.geometry.se3 import inverse, make_transform, rotation_angle_deg
+from geomoe3d.images.cameras import relative_pose
+from geomoe3d.images.pairs import choose_pairs, pose_pairs
+from geomoe3d.images.scenes import read_scene
 
 cv2 = pytest.importorskip("cv2")
+pytest.importorskip("h5py")
 NAMES = ["img_1.png", "img_2.png", "img_10.png"]
 WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
+SEEN = [[90, 60, 50], [70, 90, 10], [20, 51, 90]]  # more than 50 points: 0-1, 1-0, 2-1
 
 
 def poses():
@@ -96,7 +100,13 @@ def middlebury(folder):
     (folder / "toy_par.txt").write_text("\n".join(lines))
 
 
-LAYOUTS = [transforms, llff, kitti, colmap_text, colmap_binary, middlebury]
+def yfcc(folder):
+    images(folder / "images")
+    K = np.diag([FOCAL, FOCAL, 1.0])
+    write_published(folder, [f"images/{name}" for name in NAMES], K, [inverse(T) for T in poses()], SEEN)
+
+
+LAYOUTS = [transforms, llff, kitti, colmap_text, colmap_binary, middlebury, yfcc]
 MAIN_FILES = ("transforms.json", "poses_bounds.npy", "poses.txt", "images.txt", "images.bin", "toy_par.txt")
 each_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda f: f.__name__)
 
@@ -127,6 +137,24 @@ def test_damaged_files_are_named(layout, tmp_path):
     assert isinstance(caught.value, FormatError | InputError)
 
 
+def test_pairs_of_a_published_scene_are_those_that_see_enough_in_the_published_order(tmp_path):
+    yfcc(tmp_path)
+    drawn = [[(0, 1), (1, 0), (2, 1)][k] for k in np.random.RandomState(1234).permutation(3)]
+    assert list(read_scene(tmp_path).pairs) == drawn
+    first, second = pose_pairs(read_scene(tmp_path), 2)[0]
+    assert [first.path.name, second.path.name] == [NAMES[k] for k in drawn[0]]
+    (tmp_path / "images" / NAMES[0]).unlink()
+    assert list(read_scene(tmp_path).pairs) == [(1, 0)]  # numbers are those of the views that are there
+
+
+def test_shares_of_the_depth_image_say_who_sees_whom_in_sun3d(tmp_path):
+    images(tmp_path / "images")
+    shares = [[1, 0.5, 0.2], [0.3, 1, 0.2], [0.2, 0.4, 1]]
+    names = [f"images/{name}" for name in NAMES]
+    write_published(tmp_path, names, np.eye(3), [inverse(T) for T in poses()], shares)
+    assert sorted(read_scene(tmp_path).pairs) == [(0, 1), (2, 1)]
+
+
 def test_folders_without_cameras_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"transforms\.json"):
         read_scene(tmp_path)
@@ -142,9 +170,10 @@ def test_folders_without_cameras_are_refused(tmp_path):
 def test_pairs_are_chosen_by_their_rotation(tmp_path):
     kitti(tmp_path)
     scene = read_scene(tmp_path)
-    assert choose_pairs(scene, (20, 60), 9) == [(0, 2)]
-    assert choose_pairs(scene, (3, 20), 9) == [(0, 1), (1, 2)]
+    a, b, c = scene.views
+    assert choose_pairs(scene, (20, 60), 9) == [(a, c)]
+    assert choose_pairs(scene, (3, 20), 9) == [(a, b), (b, c)]
     assert len(choose_pairs(scene, (3, 60), 2)) == 2
     T = relative_pose(scene.views[0], scene.views[2])
     np.testing.assert_allclose(T, inverse(poses()[2]) @ poses()[0], atol=1e-5)
-    assert 20 < rotation_deg(T) < 60
+    assert 20 < rotation_angle_deg(T[:3, :3]) < 60

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geomoe3d.errors import ConfigError
 from geomoe3d.geometry.essential import essential_of, label_threshold, symmetric_distance
 from geomoe3d.networks.neighbors import neighbors_in_batch
 from geomoe3d.training.batches import ImagePairs
@@ -108,11 +107,6 @@ def test_a_run_learns_and_goes_on_to_the_bit(tmp_path):
         broken.train(Silent(), until)
     for one, other in zip(straight.model.parameters(), broken.model.parameters(), strict=True):
         assert torch.equal(one, other)
-
-
-def test_a_network_for_clouds_cannot_be_given_images_nor_the_other_way_round():
-    with pytest.raises(ConfigError, match="generated image matches"):
-        configuration("data.train=somewhere")
 
 
 def test_validation_pairs_are_the_same_for_every_training_seed():

@@ -305,6 +305,30 @@ def features(
     context.exit(0 if report.made or report.kept else ExitCode.BAD_INPUT)
 
 
+@command.command(cls=Verb, context_settings=HELP, short_help="Match photographs with cameras, to train on.")
+@click.argument("scenes", nargs=-1, required=True, type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option(
+    "--pairs", default=1000, show_default=True, type=click.IntRange(min=2), help="Per scene, at most."
+)
+@click.option("--leave-out", metavar="NAME", multiple=True, help="Scene to validate on alone; repeatable.")
+@traceback_option
+def images(scenes: tuple[str, ...], out: str, pairs: int, leave_out: tuple[str, ...]) -> None:
+    """Match the photographs of SCENES and store the matches, with their labels, in the new folder OUT.
+
+    SCENES are folders of photographs with cameras; those whose cameras are not true are refused. Scenes left out go
+    into OUT/validation, the others into OUT/train. Train with --set data.train=OUT/train and --set
+    data.validation=OUT/validation (configs/train/images).
+    """
+    from geomoe3d.cli.progress import progress_bar
+    from geomoe3d.images.training_set import write_training_set
+
+    with progress_bar("scenes") as advance:
+        made = write_training_set(scenes, out, pairs=pairs, left_out=leave_out, progress=advance)
+    for name, number in made.items():
+        click.echo(f"{name}: {counted(number, 'pair')}{', left out' if name in leave_out else ''}")
+
+
 @command.command(
     cls=Verb, context_settings=HELP, short_help="Draw pairs with proposed transforms, to train on."
 )

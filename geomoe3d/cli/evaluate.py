@@ -176,7 +176,13 @@ def methods() -> None:
 @command.command(cls=Verb, context_settings=HELP, short_help="Measure poses or homographies of photographs.")
 @click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=click.Path(exists=True))
 @click.option("--weights", type=click.Path(), help="Network that weighs matches (.safetensors).")
-@click.option("--pairs", default=200, show_default=True, type=click.IntRange(min=2), help="Per scene.")
+@click.option(
+    "--pairs",
+    default=200,
+    show_default=True,
+    type=click.IntRange(min=2),
+    help="Per scene, at most: half turned by 3 to 20 degrees, half by 20 to 60; or warps, two an image.",
+)
 @click.option("--homographies", is_flag=True, help="Homographies in place of poses.")
 @click.option("--images", type=click.Path(), help="Where the images of a list of pairs lie.")
 @click.option("--output", type=click.Path(), help="Write all errors as JSON.")
@@ -188,33 +194,30 @@ def images(
 ) -> None:  # fmt: skip
     """Measure poses or homographies of photographs: areas under the recall curve, with intervals.
 
-    For poses each FOLDER holds photographs with cameras, or is a list of pairs as published for YFCC100M and
-    ScanNet (38 words a line). For homographies it is a sequence of HPatches, a folder with NAME_pts.txt and
-    NAME_model.txt, or any images, of which exact warps are made.
+    For poses each FOLDER holds photographs with cameras, also as published for YFCC100M and SUN3D, whose pairs
+    come with it, or is a list of pairs (38 words a line). For homographies it is a sequence of HPatches, a folder
+    with NAME_pts.txt and NAME_model.txt, or any images or scene, of which exact warps are made.
     """
     import json
 
     from geomoe3d.cli.progress import progress_bar
+    from geomoe3d.images.cases import cases_of
     from geomoe3d.images.config import LIMITS
-    from geomoe3d.images.evaluate import (
-        outcomes_of,
-        summarise,
-        to_json,
-        to_markdown,
-    )
+    from geomoe3d.images.evaluate import Outcome, evaluate, summarise, to_json, to_markdown
     from geomoe3d.images.network import ImageNetwork
     from geomoe3d.runtime.files import check_output, write_text
 
     if output is not None:
         check_output(output, force=force)
     network = None if weights is None else ImageNetwork(weights)
-    outcomes = []
+    root = None if images is None else Path(images)
+    stems = [Path(folder).resolve().stem for folder in folders]
+    names = stems if len(set(stems)) == len(stems) else folders  # a name stands for one scene
+    outcomes: list[Outcome] = []
     with progress_bar("scenes") as advance:
         advance(0, len(folders))
-        for number, folder in enumerate(folders, 1):
-            outcomes += outcomes_of(
-                Path(folder), network, pairs, homographies, None if images is None else Path(images)
-            )
+        for number, (name, folder) in enumerate(zip(names, folders, strict=True), 1):
+            outcomes += evaluate(name, cases_of(Path(folder), pairs, homographies, root), network)
             advance(number, len(folders))
     table = summarise(outcomes, LIMITS.corner if homographies else LIMITS.pose)
     click.echo(to_markdown(table, len({(one.scene, one.pair) for one in outcomes})), nl=False)

@@ -61,8 +61,7 @@ def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str 
 
     Camera frames: x right, y down, z forward. Exit code 0 for the status ok, 3 for any other, 2 for bad input.
     """
-    import numpy as np
-
+    from geomoe3d.images.cameras import rays_of
     from geomoe3d.images.pose import find_pose
 
     if intrinsics is None and intrinsics1 is not None:
@@ -71,10 +70,7 @@ def command(context: click.Context, /, intrinsics: str | None, intrinsics1: str 
     paths = (Path(given["image0"]), Path(given["image1"]))
     first = _camera(intrinsics, paths[0], sizes[0])
     second = _camera(intrinsics1 or intrinsics, paths[1], sizes[1])
-    rays = np.hstack(
-        [c.normalise(matches.pixels[:, 2 * k : 2 * k + 2]) for k, c in enumerate((first, second))]
-    )
-    weights, verdict = _weights(given, matches, rays)
+    weights, verdict = _weights(given, matches, rays_of(matches.pixels, (first, second)))
     result = find_pose(
         matches.pixels, (first, second), weights=weights, estimator=given["estimator"], threshold=given["threshold"],
         seed=given["seed"],
@@ -100,16 +96,12 @@ def homography(context: click.Context, /, **given: Any) -> None:
 
     Exit code 0 for the status ok, 3 for any other, 2 for bad input.
     """
-    import numpy as np
-
-    from geomoe3d.images.cameras import Camera
+    from geomoe3d.images.cameras import Camera, rays_of
     from geomoe3d.images.config import HOMOGRAPHY
     from geomoe3d.images.homography import find_homography
 
     matches, sizes = _matches(given)
-    rays = np.hstack([
-        Camera.guess(*size).normalise(matches.pixels[:, 2 * k : 2 * k + 2]) for k, size in enumerate(sizes)
-    ])  # fmt: skip
+    rays = rays_of(matches.pixels, [Camera.guess(*size) for size in sizes])
     weights, verdict = _weights(given, matches, rays)
     result = find_homography(
         matches.pixels, weights=weights, estimator=given["estimator"],
@@ -147,7 +139,7 @@ def _weights(given: dict[str, Any], matches: Matches, rays: FloatArray) -> tuple
     if given["weights"] is None:
         return chosen.astype(np.float64), None
     verdict = ImageNetwork(given["weights"])(rays)
-    return chosen * np.maximum(np.tanh(verdict.logits), 0.0), verdict
+    return chosen * verdict.weights, verdict
 
 
 def _camera(text: str | None, image: Path, size: tuple[int, int]) -> Camera:

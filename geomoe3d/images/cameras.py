@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import DependencyError, InputError
+from geomoe3d.errors import InputError
+from geomoe3d.geometry.se3 import inverse
+from geomoe3d.runtime.optional import optional_module
 from geomoe3d.types import FloatArray
 
 
 def opencv() -> Any:
     """OpenCV. Raises DependencyError: it is not installed."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise DependencyError(
-            f"images need OpenCV ({error}); install it with: pip install 'geomoe3d[images]'"
-        ) from None
-    return cv2
-
-
-def simplejpeg() -> Any:
-    """What decodes a JPEG and tells where it is damaged. Raises DependencyError: it is not installed."""
-    try:
-        import simplejpeg
-    except ImportError as error:
-        raise DependencyError(
-            f"JPEG images need simplejpeg ({error}); install it with: pip install 'geomoe3d[images]'"
-        ) from None
-    return simplejpeg
+    return optional_module("cv2", "images need OpenCV", "'geomoe3d[images]'")
 
 
 @dataclass(frozen=True)
@@ -60,9 +46,13 @@ class Camera:
     @classmethod
     def guess(cls, width: int, height: int) -> Camera:
         """Of an unknown camera: the middle of the image, and a focal length of its longer side."""
-        return cls(
-            max(width, height), max(width, height), (width - 1) / 2, (height - 1) / 2, size=(width, height)
-        )
+        focal = max(width, height)
+        return cls(focal, focal, (width - 1) / 2, (height - 1) / 2, size=(width, height))
+
+    @classmethod
+    def of(cls, K: FloatArray) -> Camera:
+        """Of an intrinsic matrix (3, 3), or the first columns of a projection (3, 4)."""
+        return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
     @property
     def matrix(self) -> FloatArray:
@@ -82,13 +72,11 @@ class Camera:
 
     def normalise(self, pixels: FloatArray) -> FloatArray:
         """Pixels (N, 2) to rays (N, 2), x = (u - c) / f with the distortion undone."""
-        if any(self.distortion) and len(pixels):
-            points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None]
-            undone: FloatArray = opencv().undistortPoints(points, self.matrix, np.array(self.distortion))[
-                :, 0
-            ]
-            return undone
-        return (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        points = np.ascontiguousarray(pixels, dtype=np.float64)
+        if any(self.distortion) and len(points):
+            undone: FloatArray = opencv().undistortPoints(points, self.matrix, np.array(self.distortion))
+            return undone.reshape(-1, 2)
+        return (points - [self.cx, self.cy]) / [self.fx, self.fy]
 
 
 @dataclass(frozen=True)
@@ -115,20 +103,22 @@ class ImageScene:
         layout: which reader understood it.
         views: in the order of the file.
         notes: what was left out, and why.
+        pairs: of views, as published; None: to be chosen by their rotation.
     """
 
     name: str
     layout: str
     views: tuple[View, ...]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    pairs: tuple[tuple[int, int], ...] | None = None
 
 
 def relative_pose(first: View, second: View) -> FloatArray:
     """(4, 4) that maps the first camera's frame into the second's; t in the unit of the scene."""
-    T: FloatArray = second.T_camera_world @ np.linalg.inv(first.T_camera_world)
+    T: FloatArray = second.T_camera_world @ inverse(first.T_camera_world)
     return T
 
 
-def rotation_deg(T: FloatArray) -> float:
-    """Angle of rotation of (4, 4)."""
-    return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))))
+def rays_of(pixels: FloatArray, cameras: Sequence[Camera]) -> FloatArray:
+    """Matches (N, 4) in pixels of two cameras as rays (N, 4), see `Camera.normalise`."""
+    return np.hstack([camera.normalise(pixels[:, 2 * k : 2 * k + 2]) for k, camera in enumerate(cameras)])

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from geomoe3d.errors import InputError
-from geomoe3d.images.cameras import ImageScene, relative_pose
+from geomoe3d.images.cameras import ImageScene
 from geomoe3d.images.config import KEYPOINTS, TRUTH
-from geomoe3d.images.features import Keypoints, detect, match
+from geomoe3d.images.pairs import ViewMatcher, choose_pairs
 from geomoe3d.images.pose import residuals_of
-from geomoe3d.images.scenes import choose_pairs
 from geomoe3d.runtime.words import counted
 
 
@@ -22,7 +20,7 @@ class TruthCheck:
 
     Attributes:
         scene, layout, notes, num_views: of the scene.
-        num_pairs: pairs looked at, turned by 3 to 20 degrees.
+        num_pairs: pairs looked at, turned by 3 to 20 degrees, or by less where there are none.
         num_matches: mutual ones that pass the ratio test.
         share: of them within 2 pixels of their epipolar lines.
         median: pixels.
@@ -42,24 +40,17 @@ class TruthCheck:
 
 def check_truth(scene: ImageScene, pairs: int = 40, seed: int = 0) -> TruthCheck:
     """Measure the cameras of a scene on pairs drawn at random. Raises InputError: no two views are turned by
-    3 to 20 degrees against each other, or they have no matches."""
-    chosen = choose_pairs(scene, (3.0, 20.0), pairs, seed)
-    seen: dict[Path, Keypoints] = {}
-    found = []
-    for i, j in chosen:
-        views = scene.views[i], scene.views[j]
-        for view in views:
-            if view.path not in seen:
-                seen[view.path] = detect(view.path)
-        matches = match(*(seen[view.path] for view in views))
-        pixels = matches.pixels[matches.distinct()]
-        rays = np.hstack([v.camera.normalise(pixels[:, 2 * k : 2 * k + 2]) for k, v in enumerate(views)])
-        scale = KEYPOINTS.longer_side / max(seen[views[0].path].size)
-        found.append(residuals_of(relative_pose(*views), rays) * views[0].camera.focal * scale)
-    far = np.concatenate(found) if found else np.zeros(0)
+    at most 20 degrees against each other, or they have no matches."""
+    near = [choose_pairs(scene, angles, pairs, seed) for angles in ((3.0, 20.0), (0.0, 3.0))]
+    chosen = near[0] or near[1]
+    found = [np.zeros(0)]
+    for pair in map(ViewMatcher(), chosen):
+        reduced = pair.views[0].camera.focal * KEYPOINTS.longer_side / pair.longer_side
+        found.append(residuals_of(pair.T, pair.rays[pair.matches.distinct()]) * reduced)
+    far = np.concatenate(found)
     if len(far) == 0:
         raise InputError(
-            f"'{scene.name}': no match in {counted(len(chosen), 'pair')} turned by 3 to 20 degrees; "
+            f"'{scene.name}': no match in {counted(len(chosen), 'pair')} turned by at most 20 degrees; "
             "nothing says whether its cameras are true"
         )
     share, median = float((far < 2.0).mean()), float(np.median(far))

@@ -16,6 +16,7 @@ class KeypointRules(Section):
         1e-5, gt=0, description="so low that images without much contrast give as many keypoints as asked for"
     )
     ratio: float = Field(0.8, gt=0, le=1, description="ratio test by itself")
+    least_to_train: int = Field(16, ge=8, description="matches; pairs with fewer are not trained on")
     loose_ratio: float = Field(0.95, gt=0, le=1, description="behind a network that rejects wrong matches")
 
 

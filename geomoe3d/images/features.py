@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError, MissingFileError
-from geomoe3d.images.cameras import opencv, simplejpeg
+from geomoe3d.images.cameras import opencv
 from geomoe3d.images.config import KEYPOINTS
+from geomoe3d.runtime.optional import optional_module
 from geomoe3d.types import BoolArray, Float32Array, FloatArray
 
 Detector = Literal["rootsift", "sift", "orb"]
@@ -90,7 +91,8 @@ def _check_whole(path: Path) -> None:
     content = path.read_bytes()
     try:
         if content.startswith(b"\xff\xd8\xff"):
-            jpeg = simplejpeg()  # Pillow sees a JPEG cut short, but no damage inside
+            # Pillow sees a JPEG cut short, but no damage inside.
+            jpeg = optional_module("simplejpeg", "JPEG images need simplejpeg", "'geomoe3d[images]'")
             kind = jpeg.decode_jpeg_header(content, strict=True)[2]
             jpeg.decode_jpeg(content, "CMYK" if kind in ("CMYK", "YCCK") else "GRAY", strict=True)
             return
@@ -131,17 +133,14 @@ def detect(
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     if detector not in ("rootsift", "sift", "orb"):
         raise InputError(f"there is no detector '{detector}'; there are rootsift, sift and orb")
-    made = (
-        cv2.ORB_create(most)
-        if detector == "orb"
-        else cv2.SIFT_create(most, contrastThreshold=KEYPOINTS.contrast)
-    )
+    orb = detector == "orb"
+    made = cv2.ORB_create(most) if orb else cv2.SIFT_create(most, contrastThreshold=KEYPOINTS.contrast)
     found, raw = made.detectAndCompute(grey, None)
     if raw is None:
         return Keypoints(np.zeros((0, 2)), np.zeros((0, 1), np.float32), (width, height))
     # A reduced pixel stands for a square of them, whose middle is not its corner.
     pixels = (np.array([one.pt for one in found], dtype=np.float64) + 0.5) / scale - 0.5
-    values = np.unpackbits(raw, axis=1) * 2.0 - 1.0 if detector == "orb" else raw.astype(np.float64)
+    values = np.unpackbits(raw, axis=1) * 2.0 - 1.0 if orb else raw.astype(np.float64)
     if detector == "rootsift":
         values = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-12))
     values = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
@@ -158,11 +157,11 @@ def match(first: Keypoints, second: Keypoints) -> Matches:
     nearest = alike.argmax(axis=1)
     mutual = alike.argmax(axis=0)[nearest] == rows
     best = alike[rows, nearest].copy()
-    alike[rows, nearest] = -np.inf
-    other = alike.max(axis=1) if alike.shape[1] > 1 else np.full(len(alike), -1.0)
-    distances = [np.sqrt(np.maximum(2.0 - 2.0 * value.astype(np.float64), 0.0)) for value in (best, other)]
-    ratio = distances[0] / np.maximum(distances[1], 1e-12)
-    return Matches(np.hstack([first.pixels, second.pixels[nearest]]), ratio, mutual)
+    alike[rows, nearest] = -1.0  # as far apart as descriptors of unit length can be
+    best, other = (
+        np.sqrt(np.maximum(2.0 - 2.0 * x.astype(np.float64), 0.0)) for x in (best, alike.max(axis=1))
+    )
+    return Matches(np.hstack([first.pixels, second.pixels[nearest]]), best / np.maximum(other, 1e-12), mutual)
 
 
 def checked(pixels: object, weights: object, threshold: Any, seed: Any = 0) -> tuple[FloatArray, FloatArray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from geomoe3d.errors import CheckpointError
@@ -26,6 +27,11 @@ class Verdict(NamedTuple):
     logits: FloatArray
     sub_field: IntArray | None
     expert: IntArray | None
+
+    @property
+    def weights(self) -> FloatArray:
+        """(N,) in [0, 1), tanh of positive logits and 0 else, as the network is trained."""
+        return np.maximum(np.tanh(self.logits), 0.0)
 
 
 class ImageNetwork:

@@ -26,7 +26,8 @@ from geomoe3d.geometry.essential import (
     symmetric_distance,
     weighted_eight_point,
 )
-from geomoe3d.images.cameras import Camera, opencv, rotation_deg
+from geomoe3d.geometry.se3 import make_transform, project_to_so3, rotation_error_deg
+from geomoe3d.images.cameras import Camera, opencv, rays_of
 from geomoe3d.images.config import POSE
 from geomoe3d.images.features import checked
 from geomoe3d.types import BoolArray, FloatArray, IntArray
@@ -62,9 +63,7 @@ class PoseResult:
     @property
     def T(self) -> FloatArray | None:
         """(4, 4) of R and t, or None where failed."""
-        if self.R is None or self.t is None:
-            return None
-        return np.vstack([np.column_stack([self.R, self.t]), [0, 0, 0, 1]])
+        return None if self.R is None or self.t is None else make_transform(self.R, self.t)
 
 
 def find_pose(
@@ -97,9 +96,7 @@ def find_pose(
     if threshold is None:
         sides = [camera.side(pixels[usable, 2 * k : 2 * k + 2]) for k, camera in enumerate(cameras)]
         threshold = POSE.pixel_share * focal * max(sides)
-    rays = np.full_like(pixels, np.nan)
-    for k, camera in enumerate(cameras):
-        rays[usable, 2 * k : 2 * k + 2] = camera.normalise(pixels[usable, 2 * k : 2 * k + 2])
+    rays = rays_of(pixels, cameras)
     kept = w > 0
     if kept.sum() < MIN_MATCHES:
         return _failed(
@@ -238,8 +235,7 @@ def _turned(x: FloatArray) -> FloatArray:
     first, second = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (first, second))
     weights = np.ones(len(x))
     for _ in range(5):  # far points decide: those that the rotation alone explains
-        U, _, Vt = np.linalg.svd((second * weights[:, None]).T @ first)
-        R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        R = project_to_so3((second * weights[:, None]).T @ first)
         weights = 1 / (1e-4 + np.linalg.norm(first @ R.T - second, axis=1))
     moved: FloatArray = first @ R.T
     return moved[:, :2] / np.maximum(moved[:, 2:], 1e-9)
@@ -255,9 +251,9 @@ def _of_a_plane(T: FloatArray, x: FloatArray, threshold: float) -> tuple[FloatAr
     others = []
     _, turns, steps, _ = cv2.decomposeHomographyMat(H, np.eye(3))
     for R, t in zip(turns, steps, strict=True):
-        other = np.vstack([np.hstack([R, t / max(np.linalg.norm(t), 1e-12)]), [0, 0, 0, 1]])
+        other = make_transform(R, t[:, 0] / max(np.linalg.norm(t), 1e-12))
         fits = (residuals_of(other, x) < threshold) & before_both(other, x)
-        if rotation_deg(other @ np.linalg.inv(T)) > POSE.other_pose_deg and fits.mean() > POSE.explained:
+        if rotation_error_deg(other, T) > POSE.other_pose_deg and fits.mean() > POSE.explained:
             others.append(other)
     return tuple(others)
 

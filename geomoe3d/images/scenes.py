@@ -1,7 +1,8 @@
 """Readers of photographs with known cameras, each of a published layout, told apart by their files.
 
 transforms.json (instant-ngp, nerfstudio), LLFF's poses_bounds.npy, KITTI odometry (calib.txt, poses.txt), COLMAP's
-text and binary models, Middlebury's NAME_par.txt. All give OpenCV's camera frame: x right, y down, z forward.
+text and binary models, Middlebury's NAME_par.txt, and what OANet and those who followed publish of YFCC100M and SUN3D
+(images.txt, calibration.txt, visibility.txt). All give OpenCV's camera frame: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from geomoe3d.errors import FormatError, InputError, MissingFileError
 from geomoe3d.geometry.se3 import inverse, make_transform
-from geomoe3d.images.cameras import Camera, ImageScene, View, rotation_deg
-from geomoe3d.runtime.words import counted
+from geomoe3d.images.cameras import Camera, ImageScene, View
+from geomoe3d.runtime.optional import optional_module
+from geomoe3d.runtime.words import counted, natural_key
 from geomoe3d.types import FloatArray
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".tif", ".tiff")
@@ -39,68 +41,44 @@ def read_scene(folder: str | Path) -> ImageScene:
     if found is None:
         raise InputError(
             f"'{folder}' holds no photographs with cameras: none of transforms.json, poses_bounds.npy, "
-            "poses.txt with calib.txt, cameras.txt or .bin with images.txt or .bin, *_par.txt is there"
+            "poses.txt with calib.txt, cameras.txt or .bin with images.txt or .bin, *_par.txt, images.txt with "
+            "calibration.txt and visibility.txt is there"
         )
     layout, file = found
     try:
         views = list(_READERS[layout](folder, file))
+        there = [k for k, view in enumerate(views) if view.path.is_file()]
+        pairs = _visible_together(file, there) if layout == "yfcc" else None
     except InputError:
         raise
     except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
         raise FormatError(f"'{file}' is damaged, or no file of the layout {layout}: {error}") from None
-    there = [view for view in views if view.path.is_file()]
-    notes = (
-        [f"{len(views) - len(there)} of {len(views)} views have no image"] if len(there) < len(views) else []
-    )
+    lost = len(views) - len(there)
+    notes = (f"{lost} of {len(views)} views have no image",) if lost else ()
     if len(there) < 2:
         raise InputError(f"'{folder}' ({layout}) has {len(there)} views with an image; at least 2 are needed")
-    return ImageScene(folder.name, layout, tuple(there), tuple(notes))
+    return ImageScene(folder.name, layout, tuple(views[k] for k in there), notes, pairs)
 
 
 def layout_of(folder: Path) -> tuple[str, Path] | None:
     """Name of the layout and its main file, or None."""
-    for layout, name in (
-        ("transforms", "transforms.json"),
-        ("llff", "poses_bounds.npy"),
-        ("kitti", "poses.txt"),
-    ):
-        if (file := folder / name).is_file() and (layout != "kitti" or (folder / "calib.txt").is_file()):
-            return layout, file
-    for place in (folder, folder / "sparse", folder / "sparse" / "0"):
-        for suffix in (".bin", ".txt"):
-            if (place / f"cameras{suffix}").is_file() and (file := place / f"images{suffix}").is_file():
-                return "colmap", file
-    for file in sorted(folder.glob("*_par.txt")):
-        return "middlebury", file
+    for layout, (names, beside) in _FILES.items():
+        places = ("", "sparse/", "sparse/0/") if layout == "colmap" else ("",)
+        for file in (
+            file for place in places for name in names for file in sorted(folder.glob(place + name))
+        ):
+            if all((file.parent / other.format(file.suffix)).is_file() for other in beside):
+                return layout, file
     return None
-
-
-def choose_pairs(
-    scene: ImageScene, angles: tuple[float, float], count: int, seed: int = 0
-) -> list[tuple[int, int]]:
-    """At most ``count`` pairs of views whose rotation lies in [least, most) degrees, drawn at random, in order."""
-    T = [view.T_camera_world for view in scene.views]
-    pairs = [
-        (i, j)
-        for i in range(len(T))
-        for j in range(i + 1, len(T))
-        if angles[0] <= rotation_deg(T[j] @ inverse(T[i])) < angles[1]
-        and np.linalg.norm((T[j] @ inverse(T[i]))[:3, 3]) > 0
-    ]
-    chosen = np.random.default_rng(seed).permutation(len(pairs))[:count]
-    return [pairs[k] for k in sorted(chosen)]
 
 
 def images_in(folder: Path) -> list[Path]:
     """Image files of a folder by name; numbers in names count as numbers."""
-    import re
-
-    def key(path: Path) -> list[Any]:
-        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
-
     if not folder.is_dir():
         raise MissingFileError(f"no folder '{folder}' of images")
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=key)
+    return sorted(
+        (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=lambda p: natural_key(p.name)
+    )
 
 
 def _transforms(folder: Path, file: Path) -> Iterator[View]:
@@ -141,16 +119,15 @@ def _llff(folder: Path, file: Path) -> Iterator[View]:
 
 def _kitti(folder: Path, file: Path) -> Iterator[View]:
     first = (folder / "calib.txt").read_text().splitlines()[0].split(":")[-1]
-    P = np.array(first.split(), dtype=np.float64).reshape(3, 4)
+    camera = Camera.of(np.array(first.split(), dtype=np.float64).reshape(3, 4))
     place = next(
-        (folder / n for n in ("image_0", "image_2", "image_l", "images") if (folder / n).is_dir()), folder
+        (p for n in ("image_0", "image_2", "image_l", "images") if (p := folder / n).is_dir()), folder
     )
-    camera = Camera(P[0, 0], P[1, 1], P[0, 2], P[1, 2])
     poses = np.loadtxt(file, ndmin=2)
     if poses.shape[1] != 12:
         raise FormatError(f"'{file}' must have 12 numbers per line, found {poses.shape[1]}")
-    for path, row in zip(images_in(place), poses, strict=False):
-        yield View(path, camera, inverse(np.vstack([row.reshape(3, 4), [0, 0, 0, 1]])))
+    for path, row in zip(images_in(place), poses.reshape(-1, 3, 4), strict=False):
+        yield View(path, camera, inverse(make_transform(row[:, :3], row[:, 3])))
 
 
 _MODELS: dict[str, tuple[int, Callable[..., Camera]]] = {
@@ -225,15 +202,46 @@ def _middlebury(folder: Path, file: Path) -> Iterator[View]:
     for line in file.read_text(encoding="utf-8").splitlines()[1:]:
         if line.strip():
             name, *words = line.split()
-            numbers = np.array(words, dtype=np.float64)
-            K, R, t = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:21]
-            camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-            yield View(folder / name, camera, make_transform(R, t))
+            K, R, t = np.split(np.array(words, dtype=np.float64)[:21], (9, 18))
+            yield View(folder / name, Camera.of(K.reshape(3, 3)), make_transform(R.reshape(3, 3), t))
+
+
+def _yfcc(folder: Path, file: Path) -> Iterator[View]:
+    h5py = optional_module("h5py", "cameras of YFCC100M and SUN3D need h5py", "'geomoe3d[images]'")
+    for image, name in zip(*(_lines(f) for f in (file, folder / "calibration.txt")), strict=True):
+        with h5py.File(folder / name) as stored:
+            K, R, t, size = (np.array(stored[key], dtype=np.float64) for key in ("K", "R", "T", "imsize"))
+        K = K.reshape(3, 3)
+        K[:2, 2] += (size.ravel() - 1) / 2  # published from the middle of the image
+        yield View(folder / image, Camera.of(K), make_transform(R.reshape(3, 3), t.ravel()))
+
+
+def _visible_together(file: Path, there: list[int]) -> tuple[tuple[int, int], ...]:
+    """Pairs in the published order of those who drew them: both ways round, by what both images see."""
+    seen = np.stack(
+        [np.loadtxt(file.parent / name).ravel() for name in _lines(file.with_name("visibility.txt"))]
+    )
+    least = 50 if seen.max() > 1 else 0.35  # points of a reconstruction; shares of the depth image in SUN3D
+    np.fill_diagonal(seen, 0)
+    pairs = np.random.RandomState(1234).permutation(np.argwhere(seen > least))
+    place = {k: number for number, k in enumerate(there)}
+    return tuple((place[i], place[j]) for i, j in pairs.tolist() if i in place and j in place)
+
+
+def _lines(file: Path) -> list[str]:
+    return [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
 
 
 _READERS: dict[str, Callable[[Path, Path], Iterator[View]]] = {
     "transforms": _transforms, "llff": _llff, "kitti": _kitti, "colmap": _colmap, "middlebury": _middlebury,
+    "yfcc": _yfcc,
 }  # fmt: skip
+_FILES = {
+    "transforms": (("transforms.json",), ()), "llff": (("poses_bounds.npy",), ()),
+    "kitti": (("poses.txt",), ("calib.txt",)), "colmap": (("images.bin", "images.txt"), ("cameras{}",)),
+    "middlebury": (("*_par.txt",), ()), "yfcc": (("images.txt",), ("calibration.txt", "visibility.txt")),
+}  # fmt: skip
+"""Main file of each layout, and what must lie beside it, {} being its suffix."""
 
 
 def _matrix(rows: Any) -> FloatArray:

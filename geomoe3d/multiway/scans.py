@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.clouds.voxel_size import bounded_voxel_size, choose_voxel_size
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
+from geomoe3d.runtime.words import natural_key
 
 
 @dataclass(frozen=True)
@@ -150,13 +150,6 @@ def _rounded_up(size: float) -> float:
         last = math.floor(math.log10(size)) - 1  # place of the second digit
         digits = float(f"{digits + 10.0**last:.2g}")
     return digits
-
-
-def natural_key(text: str) -> list[tuple[int, int, str]]:
-    """A key by which scan 2 comes before scan 10."""
-    return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part
-    ]
 
 
 def _unique_names(paths: list[Path]) -> list[str]:

@@ -32,11 +32,11 @@ from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.pose_graph import Library
 from geomoe3d.multiway.proposals import most_similar, scan_similarity
 from geomoe3d.multiway.rules import Group, GroupingRules
-from geomoe3d.multiway.scans import Scan, natural_key
+from geomoe3d.multiway.scans import Scan
 from geomoe3d.registration import Registrar
 from geomoe3d.runtime.journal import read_journal
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, natural_key
 from geomoe3d.types import Float32Array, FloatArray, PointCloud
 
 PairKey = tuple[int, int]

@@ -24,12 +24,12 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import islice
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
-from geomoe3d.errors import DependencyError, InputError, OutputError
+from geomoe3d.errors import InputError, OutputError
+from geomoe3d.runtime.optional import optional_module
 from geomoe3d.runtime.threads import THREADS_VARIABLE
 
 Item = TypeVar("Item")
@@ -176,12 +176,7 @@ class DaskPool(Pool):
     """
 
     def __init__(self, address: str, *, wait_seconds: float = 30.0) -> None:
-        try:
-            distributed = import_module("distributed")
-        except ImportError:
-            raise DependencyError(
-                "a cluster needs Dask, which is not installed: pip install dask distributed"
-            ) from None
+        distributed = optional_module("distributed", "a cluster needs Dask", "dask distributed")
         try:
             self._client = distributed.Client(address, timeout=wait_seconds)
         except (OSError, ValueError, TimeoutError) as error:

@@ -2,7 +2,8 @@
 
 One or both clouds turned by any rotation, or up to an angle, and moved, roles exchanged, coordinates
 jittered, bent as a drifting sensor bends them, correspondences left out. Scale needs none:
-the network divides by the voxel size.
+the network divides by the voxel size. Matches of two images are only exchanged and left out: their frame is
+that of the camera.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ def augment(
     """A changed copy with at most ``max_rows`` correspondences (None: all), labels kept per row."""
     if max_rows is not None and len(pair) > max_rows:
         pair = pair.take(rng.permutation(len(pair))[:max_rows])
-    halves = [pair.correspondences[:, :3].astype(np.float64), pair.correspondences[:, 3:].astype(np.float64)]
+    halves = np.split(pair.correspondences.astype(np.float64), 2, axis=1)
     T = pair.T_target_source
     if rng.random() < config.swap:
         halves.reverse()
         T = inverse(T)
+    if pair.correspondences.shape[1] == 4:
+        return replace(pair, correspondences=np.hstack(halves).astype(np.float32), T_target_source=T)
     if config.rotate:
         # About each cloud's middle: origins far away would cost digits.
         middles = [half.mean(axis=0) for half in halves]

@@ -93,7 +93,7 @@ def open_pairs(where: str, data: DataConfig, seed: int) -> PairDataset:
 
 def open_training(config: TrainConfig) -> PairDataset | ImagePairs:
     """Training pairs of a run."""
-    if config.network.correspondence_dim == 4:
+    if config.network.correspondence_dim == 4 and config.data.train == "synthetic":
         return ImagePairs(config.data.images, config.network, config.seed)
     return open_pairs(config.data.train, config.data, config.seed)
 
@@ -123,6 +123,17 @@ def make_sample(
     data = data or DataConfig()
     points = torch.from_numpy(pair.correspondences).double()
     labels = torch.from_numpy(np.ascontiguousarray(pair.labels))
+    if points.shape[1] != network.correspondence_dim:
+        raise InputError(
+            f"its correspondences have {points.shape[1]} columns, and the network takes {network.correspondence_dim}: "
+            "4 are matches of images, 6 those of clouds"
+        )
+    if network.correspondence_dim == 4:
+        if len(points) < network.num_neighbors:
+            raise InputError(f"{len(points)} matches; the network needs at least {network.num_neighbors}")
+        matches = points.float()
+        inputs = PairInput(matches, None, neighbors_in_batch(matches[None], network.num_neighbors)[0])
+        return Sample((inputs,), labels, torch.from_numpy(pair.T_target_source).float())
     truth = network_motion(
         points, torch.from_numpy(pair.T_target_source), pair.voxel_size, network.unit_voxels
     ).float()
@@ -302,7 +313,7 @@ def first_batch(config: TrainConfig) -> Batch:
 
 def validation_samples(config: TrainConfig) -> list[Sample]:
     """The first pairs of the validation set, not augmented but cut to the training length, seeded."""
-    if config.network.correspondence_dim == 4:
+    if config.network.correspondence_dim == 4 and config.data.validation == "synthetic":
         return _image_samples(config)
     pairs = open_validation(config)
     samples = []

@@ -27,7 +27,7 @@ class DataConfig(Section):
     """Where pairs come from."""
 
     train: str = Field(
-        "synthetic", description="synthetic, or a folder of shards; of networks with 4D input, see `images`"
+        "synthetic", description="synthetic (of networks with 4D input: `images`), or a folder of shards"
     )
     validation: str = Field("synthetic", description="synthetic (other rooms), or a folder of shards")
     correspondences: int | None = Field(1000, ge=3, description="most per training pair; None: all")
@@ -110,13 +110,6 @@ class TrainConfig(Section):
             raise ValueError(
                 "a network that scores transforms is trained with data.augmentation.rotate=false, swap=0 and "
                 "jitter=0: its channels do not change with rotation, and the others would not fit the transforms"
-            )
-        if (
-            self.network.correspondence_dim == 4
-            and (self.data.train, self.data.validation) != ("synthetic",) * 2
-        ):
-            raise ValueError(
-                "a network with 4D input learns from generated image matches: data.train=synthetic"
             )
         if self.checkpoint_activations and self.network.kind != "geomoe":
             raise ValueError(

@@ -29,10 +29,12 @@ _REQUIRED = ("start", "correspondences", "labels", "T_target_source", "voxel_siz
 
 @dataclass(frozen=True)
 class TrainingPair:
-    """One pair of clouds as far as training sees it.
+    """One pair of clouds, or of images, as far as training sees it.
 
     Attributes:
-        correspondences: (N, 6) float32 rows [source xyz, target xyz], cloud units.
+        correspondences: (N, 6) float32 rows [source xyz, target xyz], cloud units; of images (N, 4) rows
+            [x0, y0, x1, y1], normalised by the intrinsics, with the pose X1 = R X0 + t, |t| = 1, for the
+            motion, labels by `geomoe3d.geometry.essential.label_threshold`, and a voxel size of 1.
         labels: (N,) True where the residual under the true motion is below the inlier threshold.
         T_target_source: (4, 4) float64 true motion, p_target = R p_source + t.
         voxel_size: cloud units.
@@ -94,7 +96,7 @@ class ShardFolder:
     """Pairs of a folder of shards, or of its subfolders, in the order of the shards' names.
 
     A shard is a folder of ``.npy`` files (mapped, recommended for large data) or one ``.npz`` file (loaded
-    whole at first use) with ``correspondences`` (sum N, 6) float32, ``start`` (P+1,) row offsets,
+    whole at first use) with ``correspondences`` (sum N, 6 or 4) float32, ``start`` (P+1,) row offsets,
     ``labels`` (sum N,) bool, ``T_target_source`` (P, 4, 4) float64, ``voxel_size`` (P,) and optionally
     ``feature_distance``, ``ratio`` and ``mutual`` (sum N,), ``motions`` (sum K, 4, 4) with ``motion_start``
     (P+1,), and ``viewpoints`` (P, 2, 3).
@@ -234,7 +236,7 @@ def _check_shard(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     start = arrays["start"]
     num_rows, num_pairs = int(start[-1]), len(start) - 1
     expected: dict[str, tuple[int, ...]] = {
-        "correspondences": (num_rows, 6),
+        "correspondences": (num_rows, 4 if arrays["correspondences"].shape[1:] == (4,) else 6),
         "T_target_source": (num_pairs, 4, 4),
     }
     expected |= {"labels": (num_rows,), "voxel_size": (num_pairs,)}

@@ -16,7 +16,8 @@ import numpy as np
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.registry import reader, writer
-from geomoe3d.errors import DependencyError, FormatError
+from geomoe3d.errors import FormatError
+from geomoe3d.runtime.optional import optional_module
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
@@ -28,11 +29,7 @@ _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 
 def require_pye57() -> Any:
     """The module pye57. Raises DependencyError: it is not installed."""
-    try:
-        import pye57
-    except ImportError:
-        raise DependencyError("E57 files need pye57, which is not installed: pip install pye57") from None
-    return pye57
+    return optional_module("pye57", "E57 files need pye57", "pye57")
 
 
 @reader(".e57")

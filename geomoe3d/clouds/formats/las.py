@@ -16,18 +16,14 @@ from numpy.typing import NDArray
 from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors, wrong_count
 from geomoe3d.clouds.formats.registry import reader, writer
 from geomoe3d.errors import DependencyError, FormatError, InputError
+from geomoe3d.runtime.optional import optional_module
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
 
 def require_laspy(compressed: bool) -> Any:
     """The module laspy, able to read and write LAZ if ``compressed``. Raises DependencyError: it is not installed."""
-    try:
-        import laspy
-    except ImportError:
-        raise DependencyError(
-            "LAS and LAZ files need laspy, which is not installed: pip install 'laspy[lazrs]'"
-        ) from None
+    laspy = optional_module("laspy", "LAS and LAZ files need laspy", "'laspy[lazrs]'")
     if compressed and not laspy.LazBackend.detect_available():
         raise DependencyError("LAZ files need lazrs, which is not installed: pip install 'laspy[lazrs]'")
     return laspy

@@ -260,12 +260,12 @@ def copied(finished, tmp_path):
 def test_what_is_refused_is_before_anything_is_removed_or_written(
     scans, copied, monkeypatch, new, named, kind, message
 ):
-    import geomoe3d.runtime.workers as workers
+    import geomoe3d.runtime.optional as optional
 
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(workers, "import_module", absent)
+    monkeypatch.setattr(optional, "import_module", absent)
     monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
     folder = copied.with_name("new") if new else copied
     before = everything(folder)
@@ -379,12 +379,12 @@ def test_the_first_reason_of_a_pair_is_told(finished):
 
 
 def test_without_dask_a_scheduler_says_what_to_install(scans, tmp_path, monkeypatch):
-    import geomoe3d.runtime.workers as workers
+    import geomoe3d.runtime.optional as optional
 
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(workers, "import_module", absent)
+    monkeypatch.setattr(optional, "import_module", absent)
     with pytest.raises(DependencyError, match=r"needs Dask, which is not installed: pip install .*d"):
         register_pairs(scans[0] / "pairs.csv", tmp_path / "o", config=CONFIG, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="either workers or a scheduler"):

@@ -279,7 +279,7 @@ def test_what_is_refused_is_before_anything_is_removed(
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr("geomoe3d.runtime.workers.import_module", absent)
+    monkeypatch.setattr("geomoe3d.runtime.optional.import_module", absent)
     monkeypatch.setattr("geomoe3d.runtime.machine.Machine.memory", lambda self: (8 << 30, 16 << 30))
     named = {"config": CONFIG, **named}
     scans = [scanned_room[0] / name for name in named.pop("scans", ["scan_0.npy", "scan_1.npy"])]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -337,7 +337,7 @@ class RegistrationResult:
 
     def to_json(self, indent: int | None = 2) -> str:
         """JSON text; floats keep every bit, missing numbers are null."""
-        return json.dumps(plain(asdict(self)), indent=indent, allow_nan=False)
+        return json.dumps(plain(self), indent=indent, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> RegistrationResult:

@@ -16,12 +16,12 @@ from geomoe3d.cli.main import geomoe3d
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.geometry.essential import essential_of, symmetric_distance
 from geomoe3d.images.network import ImageNetwork
-from geomoe3d.images.training_set import write_training_set
 from geomoe3d.networks.pretrained import load_network
 from geomoe3d.training.augment import AugmentationConfig, augment
 from geomoe3d.training.batches import make_batch, make_sample
 from geomoe3d.training.config import load_train_config
 from geomoe3d.training.pairs import ShardFolder
+from geomoe3d.training.photographs import write_training_set
 from geomoe3d.training.trainer import TrainingRun
 
 pytest.importorskip("cv2")
@@ -116,8 +116,8 @@ def test_what_cannot_be_a_training_set_is_refused_before_anything_is_written(sce
         (scenes[:1], ("hall",), "no scene remains"),
     ):
         with pytest.raises(InputError, match=words):
-            write_training_set(folders, out, pairs=4, left_out=left_out)
+            write_training_set(folders, out, count=4, left_out=left_out)
         assert not out.exists()
     out.mkdir()
     with pytest.raises(OutputError, match="exists"):
-        write_training_set(scenes[:1], out, pairs=4)
+        write_training_set(scenes[:1], out, count=4)

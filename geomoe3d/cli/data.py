@@ -57,7 +57,7 @@ def check(context: click.Context, root: str, quick: bool, as_json: bool) -> None
     from geomoe3d.images.scenes import layout_of, read_scene
 
     if layout_of(Path(root)) is not None:
-        from geomoe3d.images.check import check_truth
+        from geomoe3d.images.pairs import check_truth
 
         truth = check_truth(read_scene(root))
         click.echo(json.dumps(asdict(truth)) if as_json else (
@@ -321,10 +321,10 @@ def images(scenes: tuple[str, ...], out: str, pairs: int, leave_out: tuple[str, 
     data.validation=OUT/validation (configs/train/images).
     """
     from geomoe3d.cli.progress import progress_bar
-    from geomoe3d.images.training_set import write_training_set
+    from geomoe3d.training.photographs import write_training_set
 
     with progress_bar("scenes") as advance:
-        made = write_training_set(scenes, out, pairs=pairs, left_out=leave_out, progress=advance)
+        made = write_training_set(scenes, out, count=pairs, left_out=leave_out, progress=advance)
     for name, number in made.items():
         click.echo(f"{name}: {counted(number, 'pair')}{', left out' if name in leave_out else ''}")
 

@@ -202,10 +202,11 @@ def images(
 
     from geomoe3d.cli.progress import progress_bar
     from geomoe3d.images.cases import cases_of
-    from geomoe3d.images.config import LIMITS
-    from geomoe3d.images.evaluate import Outcome, evaluate, summarise, to_json, to_markdown
+    from geomoe3d.images.config import MEASURE
+    from geomoe3d.images.evaluate import Outcome, evaluate, summarise, to_markdown
     from geomoe3d.images.network import ImageNetwork
     from geomoe3d.runtime.files import check_output, write_text
+    from geomoe3d.runtime.plain import plain
 
     if output is not None:
         check_output(output, force=force)
@@ -219,10 +220,10 @@ def images(
         for number, (name, folder) in enumerate(zip(names, folders, strict=True), 1):
             outcomes += evaluate(name, cases_of(Path(folder), pairs, homographies, root), network)
             advance(number, len(folders))
-    table = summarise(outcomes, LIMITS.corner if homographies else LIMITS.pose)
+    table = summarise(outcomes, MEASURE.corner if homographies else MEASURE.pose)
     click.echo(to_markdown(table, len({(one.scene, one.pair) for one in outcomes})), nl=False)
     if output is not None:
-        write_text(Path(output), json.dumps(to_json(outcomes, table)) + "\n", force=force)
+        write_text(Path(output), json.dumps(plain({"summary": table, "pairs": outcomes})) + "\n", force=force)
 
 
 def _predict(

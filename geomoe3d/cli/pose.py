@@ -41,7 +41,7 @@ def _shared(estimators: tuple[str, ...], threshold: str) -> Option:
         click.option("--seed", metavar="N", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1),
                      help="Random seed: the same seed, the same answers."),
         click.option("--output", metavar="FILE.json", help="Write the answer as JSON."),
-        click.option("--picture", metavar="FILE", help="Draw the matches: .png, .jpg, .pdf or .svg."),
+        click.option("--picture", metavar="FILE", help="Draw the matches: .png, .jpg, .webp, .pdf or .svg."),
         click.option("--force", is_flag=True, help="Replace files that exist."),
     )  # fmt: skip
 
@@ -113,10 +113,10 @@ def homography(context: click.Context, /, **given: Any) -> None:
 
 def _matches(given: dict[str, Any]) -> tuple[Matches, list[tuple[int, int]]]:
     from geomoe3d.images.features import detect, match
-    from geomoe3d.images.picture import SUFFIXES
+    from geomoe3d.visual.paper import FORMATS
 
     names = [given["image0"], given["image1"]]
-    wanted = (("--output", given["output"], (".json",)), ("--picture", given["picture"], SUFFIXES))
+    wanted = (("--output", given["output"], (".json",)), ("--picture", given["picture"], FORMATS))
     check_outputs(wanted, [*names, *filter(None, [given["weights"]])], given["force"])
     keypoints = [detect(name, given["detector"], given["keypoints"]) for name in names]
     for name, one in zip(names, keypoints, strict=True):
@@ -172,8 +172,9 @@ def _tell(
     import numpy as np
 
     from geomoe3d.images.features import read_grey
-    from geomoe3d.images.picture import save_matches
+    from geomoe3d.images.picture import draw_matches
     from geomoe3d.runtime.files import write_text
+    from geomoe3d.visual.paper import save_figure
 
     if filecmp.cmp(given["image0"], given["image1"], shallow=False):
         reasons.append("both images are the same file")
@@ -198,13 +199,9 @@ def _tell(
     if given["picture"] is not None:
         images = (read_grey(given["image0"]), read_grey(given["image1"]))
         sub_field, expert = (None, None) if verdict is None else verdict[1:]
-        save_matches(
+        save_figure(
             given["picture"],
-            images,
-            matches.pixels,
-            inliers,
-            sub_field=sub_field,
-            expert=expert,
+            lambda _: draw_matches(images, matches.pixels, inliers, sub_field=sub_field, expert=expert),
             force=given["force"],
         )
     context.exit(0 if status == "ok" else ExitCode.NOT_SURE)

@@ -185,7 +185,7 @@ def _check_outputs(outputs: _Outputs, inputs: Sequence[str], scale: float | None
     """
     from geomoe3d.clouds.io import check_aligned
     from geomoe3d.clouds.transform_files import check_scale_format, transform_format
-    from geomoe3d.visual.picture import FORMATS
+    from geomoe3d.visual.paper import FORMATS
 
     wanted = (
         *(("--output", str(transform_format(path)[1]), ()) for path in outputs.transforms),

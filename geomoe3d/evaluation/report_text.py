@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 
 from geomoe3d.evaluation.compare import Comparison
 from geomoe3d.evaluation.records import RunScore
@@ -130,7 +129,7 @@ def benchmark_tables(scores: Sequence[RunScore]) -> str:
             rows = [
                 [_plain(run.info.label), value_and_interval(run.measures.get("accepted"))] for run in ranked
             ]
-            lines += _table(["run", "accepted, %"], rows)
+            lines += markdown_table(["run", "accepted, %"], rows)
         else:
             lines += _main_lines({_plain(run.info.label): run for run in ranked})
     lines += [LEGEND[0].upper() + LEGEND[1:], ""]
@@ -145,7 +144,9 @@ def benchmark_tables(scores: Sequence[RunScore]) -> str:
     ]
     if rows:
         lines += ["### Confidence", ""]
-        lines += _table(["run", "benchmark", "AUROC of success", "calibration error", "accepted, %"], rows)
+        lines += markdown_table(
+            ["run", "benchmark", "AUROC of success", "calibration error", "accepted, %"], rows
+        )
     said = (
         [f"Commit {run.info.commit or 'unknown'}" for run in scores],
         [run.info.hardware for run in scores],
@@ -165,7 +166,7 @@ def _main_lines(runs: Mapping[str, RunScore]) -> list[str]:
         [name, value_and_interval(run.measures.get("recall_15")), *main_row(run)[1:]]
         for name, run in runs.items()
     ]
-    return _table(["run", *(heading.replace("\n", " ") for heading in COLUMNS.values())], rows)
+    return markdown_table(["run", *(heading.replace("\n", " ") for heading in COLUMNS.values())], rows)
 
 
 def _comparison_lines(found: Comparison) -> list[str]:
@@ -177,7 +178,7 @@ def _comparison_lines(found: Comparison) -> list[str]:
         f"{found.num_only_in_b:,} by {b} only.",
         "",
         *(f"- {_plain(note)}\n" for note in found.notes),
-        *_table(["", "value [95 % over pairs] [over scenes]"], comparison_rows(found, (a, b))),
+        *markdown_table(["", "value [95 % over pairs] [over scenes]"], comparison_rows(found, (a, b))),
     ]
     for who, ids in ((a, found.a_only_right), (b, found.b_only_right)):
         if ids:
@@ -203,7 +204,7 @@ def _run_lines(run: RunScore) -> list[str]:
         ]
         for name, found in run.measures.items()
     ]
-    lines += _table(head, rows)
+    lines += markdown_table(head, rows)
     names = list(dict.fromkeys(name for measures in run.scenes.values() for name in measures))
     rows = [
         [
@@ -213,13 +214,13 @@ def _run_lines(run: RunScore) -> list[str]:
         ]
         for scene, measures in run.scenes.items()
     ]
-    lines += _table(["scene", "pairs", *(f"`{name}`" for name in names)], rows)
+    lines += markdown_table(["scene", "pairs", *(f"`{name}`" for name in names)], rows)
     for curve in run.curves.values():
         rows = [
             [f"{low:g} to {high:g}", f"{found.count:,}", value_and_interval(found)]
             for low, high, found in zip(curve.edges[:-1], curve.edges[1:], curve.measures, strict=True)
         ]
-        lines += _table([curve.quantity, "pairs", "recall 15/0.30, % [95 % over pairs]"], rows)
+        lines += markdown_table([curve.quantity, "pairs", "recall 15/0.30, % [95 % over pairs]"], rows)
     if run.calibration is not None:
         error, auroc = map(with_intervals, (run.calibration.calibration_error, run.calibration.auroc))
         lines += [f"Confidence: expected calibration error {error}, AUROC {auroc}.", ""]
@@ -232,11 +233,12 @@ def _run_lines(run: RunScore) -> list[str]:
             ]
             for b in run.calibration.bins
         ]
-        lines += _table(["confidence", "pairs", "mean confidence", "share right"], rows)
+        lines += markdown_table(["confidence", "pairs", "mean confidence", "share right"], rows)
     return lines
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table and an empty one behind it; none where there are no rows."""
     rule = ["---", *("---:" for _ in head[1:])]
     return [*("| " + " | ".join(row) + " |" for row in (head, rule, *rows)), ""] if rows else []
 
@@ -262,7 +264,7 @@ def to_json(scores: Sequence[RunScore], comparisons: Sequence[Comparison] = ()) 
     """Everything as strict JSON with keys as in the records; numbers that are not finite become null."""
     document = {
         "format": FORMAT,
-        "runs": [plain(asdict(run)) for run in scores],
-        "comparisons": [plain(asdict(comparison)) for comparison in comparisons],
+        "runs": plain(scores),
+        "comparisons": plain(comparisons),
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

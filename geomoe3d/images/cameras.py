@@ -20,6 +20,15 @@ def opencv() -> Any:
     return optional_module("cv2", "images need OpenCV", "'geomoe3d[images]'")
 
 
+def robust_estimator(name: str, seed: int, plain: str) -> tuple[Any, int]:
+    """OpenCV, its random numbers seeded, and its constant for an estimator. Raises InputError: it is none."""
+    cv2 = opencv()
+    if name not in ("ransac", "magsac"):
+        raise InputError(f"there is no estimator '{name}'; there are magsac, ransac and {plain}")
+    cv2.setRNGSeed(seed)
+    return cv2, cv2.RANSAC if name == "ransac" else cv2.USAC_MAGSAC
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics of one image.
@@ -40,8 +49,10 @@ class Camera:
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not (np.isfinite(values).all() and self.fx > 0 and self.fy > 0):
-            raise InputError(f"intrinsics fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}: focal lengths "
-                             "must be positive, and all of them finite")  # fmt: skip
+            given = ", ".join(
+                f"{name}={value}" for name, value in zip(("fx", "fy", "cx", "cy"), values, strict=False)
+            )
+            raise InputError(f"intrinsics {given}: focal lengths must be positive, and all of them finite")
 
     @classmethod
     def guess(cls, width: int, height: int) -> Camera:
@@ -53,11 +64,6 @@ class Camera:
     def of(cls, K: FloatArray) -> Camera:
         """Of an intrinsic matrix (3, 3), or the first columns of a projection (3, 4)."""
         return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-
-    @property
-    def matrix(self) -> FloatArray:
-        """(3, 3)."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     @property
     def focal(self) -> float:
@@ -74,43 +80,30 @@ class Camera:
         """Pixels (N, 2) to rays (N, 2), x = (u - c) / f with the distortion undone."""
         points = np.ascontiguousarray(pixels, dtype=np.float64)
         if any(self.distortion) and len(points):
-            undone: FloatArray = opencv().undistortPoints(points, self.matrix, np.array(self.distortion))
+            K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+            undone: FloatArray = opencv().undistortPoints(points, K, np.array(self.distortion))
             return undone.reshape(-1, 2)
         return (points - [self.cx, self.cy]) / [self.fx, self.fy]
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph of a scene.
-
-    Attributes:
-        path: of the image.
-        camera: its intrinsics.
-        T_camera_world: (4, 4), X_camera = R X_world + t; x right, y down, z forward.
-    """
+    """One photograph of a scene."""
 
     path: Path
     camera: Camera
-    T_camera_world: FloatArray
+    T_camera_world: FloatArray  # (4, 4), X_camera = R X_world + t; x right, y down, z forward
 
 
 @dataclass(frozen=True)
 class ImageScene:
-    """Photographs with known cameras.
+    """Photographs with known cameras."""
 
-    Attributes:
-        name: of its folder.
-        layout: which reader understood it.
-        views: in the order of the file.
-        notes: what was left out, and why.
-        pairs: of views, as published; None: to be chosen by their rotation.
-    """
-
-    name: str
-    layout: str
-    views: tuple[View, ...]
-    notes: tuple[str, ...] = ()
-    pairs: tuple[tuple[int, int], ...] | None = None
+    name: str  # of its folder
+    layout: str  # which reader understood it
+    views: tuple[View, ...]  # in the order of the file
+    notes: tuple[str, ...] = ()  # what was left out, and why
+    pairs: tuple[tuple[int, int], ...] | None = None  # as published; None: to be chosen by rotation
 
 
 def relative_pose(first: View, second: View) -> FloatArray:

@@ -6,107 +6,77 @@ A pair of photographs goes through keypoints and matches once; every method gets
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from geomoe3d.errors import FormatError, InputError
-from geomoe3d.geometry.essential import pose_errors_deg
-from geomoe3d.geometry.se3 import rotation_angle_deg
 from geomoe3d.images.cameras import Camera, View, opencv, rays_of
 from geomoe3d.images.config import KEYPOINTS
 from geomoe3d.images.features import Matches, detect, match, read_grey
 from geomoe3d.images.homography import corner_error, find_homography, map_points
 from geomoe3d.images.pairs import MatchedPair, ViewMatcher, ViewPair, pose_pairs
-from geomoe3d.images.pose import find_pose
 from geomoe3d.images.scenes import images_in, layout_of, read_scene
 from geomoe3d.types import BoolArray, FloatArray
 
-POSE_ESTIMATORS = {"RANSAC": "ransac", "MAGSAC++": "magsac", "eight-point": "eight_point"}
-HOMOGRAPHY_ESTIMATORS = {"RANSAC": "ransac", "MAGSAC++": "magsac", "DLT": "dlt"}
-"""Names in tables; the last one of either takes the weights themselves and rejects nothing."""
-
 
 @dataclass(frozen=True)
-class Case:
-    """A pair with known answer.
-
-    Attributes:
-        name: of the pair.
-        matches: that every method gets.
-        rays: (N, 4) the same as a network sees them.
-        true: (N,) bool, which of them fit the truth.
-        estimators: name in tables and keyword.
-        answer: weights (N,) and keyword of an estimator to error (infinite without an answer) and status.
-        turned: rotation between the cameras, degrees; NaN for homographies.
-    """
+class HomographyPair:
+    """Two images of a plane with their matches and the truth; offers what `MatchedPair` does."""
 
     name: str
-    matches: Matches
-    rays: FloatArray
-    true: BoolArray
-    estimators: dict[str, str]
-    answer: Callable[[FloatArray, Any], tuple[float, str]]
-    turned: float = math.nan
+    matches: Matches  # in pixels
+    H: FloatArray  # (3, 3) true homography, pixel1 ~ H pixel0
+    size: tuple[int, int]  # width and height of the first image
+    plain = "DLT"
+    turned = math.nan
+
+    @property
+    def rays(self) -> FloatArray:
+        """(N, 4) as a network sees the matches, of guessed cameras."""
+        return rays_of(self.matches.pixels, [Camera.guess(*self.size)] * 2)
+
+    @property
+    def true(self) -> BoolArray:
+        """(N,) which matches end within 3 pixels of where the truth sends them."""
+        first, second = self.matches.pixels[:, :2], self.matches.pixels[:, 2:]
+        within: BoolArray = np.linalg.norm(map_points(self.H, first) - second, axis=1) < 3.0
+        return within
+
+    def answer(self, estimator: Any, weights: FloatArray) -> tuple[float, str]:
+        """Mean error of the first image's corners, pixels (infinite without H), and the status; see
+        `find_homography`."""
+        found = find_homography(self.matches.pixels, weights=weights, estimator=estimator)
+        return corner_error(found.H, self.H, self.size), found.status
 
 
-def pose_cases(pairs: Iterable[ViewPair], seed: int = 0) -> Iterator[Case]:
-    """Relative poses; the error is the larger of the angles of rotation and translation, degrees."""
-    for pair in map(ViewMatcher(), pairs):
-        name = "-".join(view.path.stem for view in pair.views)
-        answer = partial(_pose_error, pair, seed)
-        turned = rotation_angle_deg(pair.T[:3, :3])
-        yield Case(name, pair.matches, pair.rays, pair.true, POSE_ESTIMATORS, answer, turned)
-
-
-def _pose_error(pair: MatchedPair, seed: int, weights: FloatArray, estimator: Any) -> tuple[float, str]:
-    cameras = (pair.views[0].camera, pair.views[1].camera)
-    result = find_pose(pair.matches.pixels, cameras, weights=weights, estimator=estimator, seed=seed)
-    if result.T is None:
-        return math.inf, result.status
-    errors = pose_errors_deg(torch.from_numpy(result.T), torch.from_numpy(pair.T))
-    return float(max(errors)), result.status
-
-
-def homography_case(name: str, found: Matches, H: FloatArray, size: tuple[int, int]) -> Case:
-    """Of a true homography and the size of the first image; the error is the mean of its corners', pixels."""
-    rays = rays_of(found.pixels, [Camera.guess(*size)] * 2)
-    true = np.linalg.norm(map_points(H, found.pixels[:, :2]) - found.pixels[:, 2:], axis=1) < 3.0  # pixels
-
-    def answer(weights: FloatArray, estimator: Any) -> tuple[float, str]:
-        result = find_homography(found.pixels, weights=weights, estimator=estimator)
-        return corner_error(result.H, H, size), result.status
-
-    return Case(name, found, rays, true, HOMOGRAPHY_ESTIMATORS, answer)
+Case = MatchedPair | HomographyPair
 
 
 def read_pair_list(file: Path, root: Path | None = None) -> list[ViewPair]:
     """Pairs of a list as published for YFCC100M and ScanNet: a line has two names, two turns of the images
     (unused), two 3 x 3 intrinsics and a 4 x 4 pose of the second camera, row by row. Images lie in ``root``,
-    else beside the list. Raises FormatError: a line has another number of words, or one that is no number."""
+    else beside the list. Raises FormatError: it is no such list."""
+    try:
+        rows = np.loadtxt(file, dtype=str, ndmin=2)
+        numbers = rows[:, 4:].astype(np.float64)
+    except ValueError as error:
+        raise FormatError(f"'{file}' is no list of pairs: {error}") from None
+    if rows.shape[1] != 38:
+        raise FormatError(f"'{file}' has {rows.shape[1]} words a line; a pair has 38")
     pairs = []
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
-        words = line.split()
-        if words and len(words) != 38:
-            raise FormatError(f"'{file}' line {number} has {len(words)} words; a pair has 38")
-        if words:
-            try:
-                values = np.array(words[4:], dtype=np.float64)
-            except ValueError as error:
-                raise FormatError(f"'{file}' line {number}: {error}") from None
-            cameras = [Camera.of(K) for K in values[:18].reshape(2, 3, 3)]
-            poses = (np.eye(4), values[18:].reshape(4, 4))
-            one, other = (View((root or file.parent) / words[k], cameras[k], poses[k]) for k in (0, 1))
-            pairs.append((one, other))
+    for names, values in zip(rows, numbers, strict=True):
+        cameras = [Camera.of(K) for K in values[:18].reshape(2, 3, 3)]
+        poses = (np.eye(4), values[18:].reshape(4, 4))
+        one, other = (View((root or file.parent) / names[k], cameras[k], poses[k]) for k in (0, 1))
+        pairs.append((one, other))
     return pairs
 
 
-def warped_cases(folder: Path, count: int, seed: int = 0) -> Iterator[Case]:
+def warped_cases(folder: Path, count: int, seed: int = 0) -> Iterator[HomographyPair]:
     """At most ``count`` exact warps, two of an image, darkened and with noise, of images spread evenly over those
     of a folder or of a scene; all reduced to 800 pixels."""
     cv2 = opencv()
@@ -120,51 +90,57 @@ def warped_cases(folder: Path, count: int, seed: int = 0) -> Iterator[Case]:
         scale = KEYPOINTS.longer_side / max(image.shape)
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         height, width = image.shape
+        middle = (width / 2, height / 2)
         square = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
         first = detect(image)
         for k in range(2):
             rng = np.random.default_rng([seed, number, k])
-            turned = np.radians(rng.uniform(-45, 45))
-            R = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
-            middle = np.array([width, height]) / 2
-            moved = (square - middle) @ R.T * rng.uniform(0.6, 1.2) + middle
-            moved = moved + rng.uniform(-0.2, 0.2, (4, 2)) * [width, height]
+            turn = cv2.getRotationMatrix2D(middle, -rng.uniform(-45, 45), rng.uniform(0.6, 1.2))
+            moved = cv2.transform(square[None], turn)[0] + rng.uniform(-0.2, 0.2, (4, 2)) * image.shape[::-1]
             H = cv2.getPerspectiveTransform(square, moved.astype(np.float32))
             other = cv2.warpPerspective(image, H, (width, height)) * rng.uniform(0.6, 1.0)
             other = np.clip(other + rng.normal(0, 4, other.shape), 0, 255).astype(np.uint8)
             name = f"{paths[number].stem}/{k}"
-            yield homography_case(name, match(first, detect(other)), H, (width, height))
+            yield HomographyPair(name, match(first, detect(other)), H, (width, height))
 
 
-def hpatches_cases(folder: Path) -> Iterator[Case]:
+def hpatches_cases(folder: Path) -> Iterator[HomographyPair]:
     """A sequence as HPatches publishes it: 1.ppm to 6.ppm with H_1_2 to H_1_6."""
     first = detect(folder / "1.ppm", most=4000)
     for k in range(2, 7):
         found = match(first, detect(folder / f"{k}.ppm", most=4000))
-        yield homography_case(f"1-{k}", found, np.loadtxt(folder / f"H_1_{k}"), first.size)
+        yield HomographyPair(f"1-{k}", found, _numbers(folder / f"H_1_{k}", 3), first.size)
 
 
-def model_cases(folder: Path) -> Iterator[Case]:
+def model_cases(folder: Path) -> Iterator[HomographyPair]:
     """Pairs of danini/magsac: NAME_pts.txt (u0 v0 1 u1 v1 1) and NAME_model.txt, which maps B into A.
 
     Ratio and mutuality of the matches are not known: all count as distinct.
     """
+    images = {path.stem: path for path in images_in(folder)}
     for file in sorted(folder.glob("*_model.txt")):
         name = file.name.removesuffix("_model.txt")
-        rows = np.loadtxt(folder / f"{name}_pts.txt")[:, [0, 1, 3, 4]]
-        image = next(path for path in images_in(folder) if path.stem == f"{name}A")
-        height, width = read_grey(image).shape
+        rows = _numbers(folder / f"{name}_pts.txt", 6)[:, [0, 1, 3, 4]]
+        height, width = read_grey(images.get(f"{name}A", folder / f"{name}A.png")).shape
         matches = Matches(rows, np.zeros(len(rows)), np.ones(len(rows), dtype=bool))
-        H = np.asarray(np.linalg.inv(np.loadtxt(file)), dtype=np.float64)
-        yield homography_case(name, matches, H, (width, height))
+        yield HomographyPair(name, matches, np.linalg.inv(_numbers(file, 3)).astype(float), (width, height))
+
+
+def _numbers(file: Path, columns: int) -> FloatArray:
+    try:
+        rows: FloatArray = np.loadtxt(file, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise FormatError(f"'{file}' cannot be read: {error}") from None
+    if rows.shape[1] < columns:
+        raise FormatError(f"'{file}' has {rows.shape[1]} numbers a line; at least {columns} are needed")
+    return rows
 
 
 def cases_of(path: Path, count: int, homographies: bool, root: Path | None = None) -> Iterator[Case]:
     """What lies at a path: a scene or a list of pairs, or one of the three kinds of homographies."""
     if not homographies:
-        return pose_cases(
-            read_pair_list(path, root) if path.is_file() else pose_pairs(read_scene(path), count)
-        )
+        listed = read_pair_list(path, root) if path.is_file() else pose_pairs(read_scene(path), count)
+        return map(ViewMatcher(), listed)
     if (path / "H_1_2").is_file():
         return hpatches_cases(path)
     return model_cases(path) if any(path.glob("*_model.txt")) else warped_cases(path, count)

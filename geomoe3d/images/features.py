@@ -23,32 +23,20 @@ Detector = Literal["rootsift", "sift", "orb"]
 
 @dataclass(frozen=True)
 class Keypoints:
-    """Of one image.
+    """Of one image."""
 
-    Attributes:
-        pixels: (N, 2) in the image as stored.
-        descriptors: (N, C) float32 of unit length.
-        size: width and height of the image.
-    """
-
-    pixels: FloatArray
-    descriptors: Float32Array
-    size: tuple[int, int]
+    pixels: FloatArray  # (N, 2) in the image as stored
+    descriptors: Float32Array  # (N, C) of unit length
+    size: tuple[int, int]  # width and height of the image
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Of two images.
+    """Of two images."""
 
-    Attributes:
-        pixels: (N, 4) rows [u0, v0, u1, v1].
-        ratio: (N,) distance of the descriptors over that to the second nearest, below 1.
-        mutual: (N,) bool, each the other's nearest.
-    """
-
-    pixels: FloatArray
-    ratio: FloatArray
-    mutual: BoolArray
+    pixels: FloatArray  # (N, 4) rows [u0, v0, u1, v1]
+    ratio: FloatArray  # (N,) distance of the descriptors over that to the second nearest, at most 1
+    mutual: BoolArray  # (N,) each the other's nearest
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -63,8 +51,7 @@ def read_grey(path: str | Path) -> NDArray[np.uint8]:
 
     Raises:
         MissingFileError: there is none.
-        InputError: OpenCV cannot read it.
-        FormatError: it is damaged or cut short.
+        InputError: OpenCV cannot read it; as FormatError: it is damaged or cut short.
         DependencyError: OpenCV or, for a JPEG, simplejpeg is not installed.
     """
     cv2 = opencv()
@@ -72,9 +59,8 @@ def read_grey(path: str | Path) -> NDArray[np.uint8]:
         raise InputError(f"'{path}' is a folder; give one image of it")
     if not Path(path).is_file():
         raise MissingFileError(f"there is no image '{path}'; check the path")
-    image: NDArray[np.uint8] | None = cv2.imread(
-        str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    )
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    image: NDArray[np.uint8] | None = cv2.imread(str(path), flags)
     if image is None:
         raise InputError(
             f"'{path}' cannot be read as an image: it is damaged, or of a kind that OpenCV "
@@ -114,13 +100,12 @@ def detect(
     most: int = KEYPOINTS.number,
     longer_side: int = KEYPOINTS.longer_side,
 ) -> Keypoints:
-    """Keypoints of an image, reduced to ``longer_side`` pixels first where it is larger.
+    """The strongest ``most`` keypoints of an image, reduced to ``longer_side`` pixels first where it is larger.
 
     Args:
         image: path, or (height, width) uint8.
         detector: ``rootsift`` is SIFT under the Hellinger distance (Arandjelović and Zisserman 2012).
-        most: the strongest so many.
-        longer_side: pixels.
+        most, longer_side: see above.
 
     Raises:
         MissingFileError, InputError: see `read_grey`; or an unknown detector.
@@ -164,6 +149,17 @@ def match(first: Keypoints, second: Keypoints) -> Matches:
     return Matches(np.hstack([first.pixels, second.pixels[nearest]]), best / np.maximum(other, 1e-12), mutual)
 
 
+def halves_of(matches: FloatArray) -> list[FloatArray]:
+    """First and second points (N, 2) of matches (N, 4), as OpenCV takes them."""
+    return [np.ascontiguousarray(matches[:, :2]), np.ascontiguousarray(matches[:, 2:])]
+
+
+def random_halves(rows: NDArray[Any]) -> list[NDArray[Any]]:
+    """Rows in two halves, drawn at random, the same ones each time."""
+    order = np.random.default_rng(0).permutation(rows)
+    return [order[::2], order[1::2]]
+
+
 def checked(pixels: object, weights: object, threshold: Any, seed: Any = 0) -> tuple[FloatArray, FloatArray]:
     """Matches (N, 4) and their weights (N,), 0 for rows that are not finite and 1 where none are given.
     Raises InputError: shapes do not fit, values that are no real numbers or no pixels, a threshold that is
@@ -190,8 +186,7 @@ def _numbers(name: str, values: object) -> FloatArray:
         array = np.asarray(values)
     except ValueError:  # rows of different lengths
         array = np.asarray(None)
-    if array.dtype.kind not in "fiub":
-        raise InputError(
-            f"{name} must be an array of real numbers, found {type(values).__name__} ({array.dtype})"
-        )
-    return array.astype(np.float64)
+    if array.dtype.kind in "fiub":
+        return array.astype(np.float64)
+    found = f"{type(values).__name__} ({array.dtype})"
+    raise InputError(f"{name} must be an array of real numbers, found {found}")

@@ -8,11 +8,10 @@ from typing import Literal
 import numpy as np
 import torch
 
-from geomoe3d.errors import InputError
 from geomoe3d.geometry.homography import MIN_MATCHES, weighted_dlt
-from geomoe3d.images.cameras import opencv
+from geomoe3d.images.cameras import robust_estimator
 from geomoe3d.images.config import HOMOGRAPHY
-from geomoe3d.images.features import checked
+from geomoe3d.images.features import checked, halves_of, random_halves
 from geomoe3d.types import BoolArray, FloatArray
 
 
@@ -46,54 +45,56 @@ def find_homography(
     """The homography that matches (N, 4) = [u0, v0, u1, v1] agree on; arguments as of `geomoe3d.images.pose`.
     Raises InputError: shapes do not fit, a threshold that is not positive, or an unknown estimator."""
     pixels, w = checked(pixels, weights, threshold, seed)
-    usable = np.isfinite(pixels).all(axis=1)
     kept = np.flatnonzero(w > 0)
-    nothing = HomographyResult("failed", (), None, np.zeros(len(pixels), bool), np.full(len(pixels), np.inf))
-    if len(kept) < MIN_MATCHES:
-        reason = f"{len(kept)} matches are kept of {len(pixels)}; at least {MIN_MATCHES} are needed"
-        return HomographyResult("failed", (reason,), None, nothing.inliers, nothing.residuals)
-    if estimator == "dlt":
-        found, fixed = weighted_dlt(torch.from_numpy(pixels[kept]), torch.from_numpy(w[kept]))
-        H = found.numpy() if bool(fixed) else None
-    elif estimator in ("ransac", "magsac"):
-        cv2 = opencv()
-        cv2.setRNGSeed(seed)
-        method = cv2.RANSAC if estimator == "ransac" else cv2.USAC_MAGSAC
-        first, second = (np.ascontiguousarray(pixels[kept, k : k + 2]) for k in (0, 2))
-        H, _ = cv2.findHomography(first, second, method, threshold, maxIters=2000, confidence=0.99999)
-    else:
-        raise InputError(f"there is no estimator '{estimator}'; there are magsac, ransac and dlt")
-    if H is None or not np.isfinite(H).all() or abs(np.linalg.det(H / np.linalg.norm(H))) < 1e-12:
+    few = len(kept) < MIN_MATCHES
+    H = None if few else _estimate(pixels[kept], w[kept], estimator, threshold, seed)
+    if H is None:
         reason = "the matches fix no homography: at least four of them must lie at places of which no three are in line"
-        return HomographyResult("failed", (reason,), None, nothing.inliers, nothing.residuals)
-    H = H / (H[2, 2] if abs(H[2, 2]) > 1e-12 else 1.0)
-    residuals = np.where(usable, np.linalg.norm(map_points(H, pixels[:, :2]) - pixels[:, 2:], axis=1), np.inf)
-    residuals = np.nan_to_num(residuals, nan=np.inf)
-    inliers = (residuals < threshold) & (w > 0)
+        if few:
+            reason = f"{len(kept)} matches are kept of {len(pixels)}; at least {MIN_MATCHES} are needed"
+        none = np.zeros(len(pixels), dtype=bool)
+        return HomographyResult("failed", (reason,), None, none, np.full(len(pixels), np.inf))
+    apart = np.linalg.norm(map_points(H, pixels[:, :2]) - pixels[:, 2:], axis=1)
+    residuals = np.where(np.isfinite(apart), apart, np.inf)
+    inliers = np.asarray((residuals < threshold) & (w > 0))
+    reasons = _doubts(H, pixels[np.isfinite(pixels).all(axis=1)], pixels[inliers], threshold)
+    return HomographyResult("low_confidence" if reasons else "ok", tuple(reasons), H, inliers, residuals)
+
+
+def _estimate(
+    pixels: FloatArray, w: FloatArray, estimator: str, threshold: float, seed: int
+) -> FloatArray | None:
+    if estimator == "dlt":
+        found, fixed = weighted_dlt(torch.from_numpy(pixels), torch.from_numpy(w))
+        H = found.numpy() if bool(fixed) else None
+    else:
+        cv2, method = robust_estimator(estimator, seed, "dlt")
+        H, _ = cv2.findHomography(*halves_of(pixels), method, threshold, maxIters=2000, confidence=0.99999)
+    if H is None or not np.isfinite(H).all() or abs(np.linalg.det(H / np.linalg.norm(H))) < 1e-12:
+        return None
+    return np.asarray(H / (H[2, 2] if abs(H[2, 2]) > 1e-12 else 1.0))
+
+
+def _doubts(H: FloatArray, matches: FloatArray, inliers: FloatArray, threshold: float) -> list[str]:
+    """Why a homography may be wrong, of all matches (N, 4) and its inliers (K, 4)."""
     reasons = []
-    if inliers.sum() < HOMOGRAPHY.least_inliers:
-        reasons.append(
-            f"{inliers.sum()} inliers; below {HOMOGRAPHY.least_inliers} a wrong homography finds as many"
-        )
-    elif (
-        np.linalg.matrix_rank(pixels[inliers, :2] - pixels[inliers, :2].mean(axis=0), tol=10 * threshold) < 2
-    ):
+    if len(inliers) < HOMOGRAPHY.least_inliers:
+        few = f"{len(inliers)} inliers; below {HOMOGRAPHY.least_inliers}"
+        reasons.append(f"{few} a wrong homography finds as many")
+    elif np.linalg.matrix_rank(inliers[:, :2] - inliers[:, :2].mean(axis=0), tol=10 * threshold) < 2:
         reasons.append("the inliers lie in line or at one place, and fix the homography nowhere else")
-    extent = np.array([[x, y] for x in _range(pixels[usable, 0]) for y in _range(pixels[usable, 1])])
+    (left, top), (right, bottom) = matches[:, :2].min(axis=0), matches[:, :2].max(axis=0)
+    extent = np.array([[left, top], [left, bottom], [right, top], [right, bottom]])
     corners = map_points(H, extent)
     if not np.isfinite(corners).all():
         reasons.append("it sends a part of the first image behind the camera")
     if not reasons:
-        off, order = 0.0, np.random.default_rng(0).permutation(np.flatnonzero(inliers))
-        for half in (order[::2], order[1::2]):
-            other, _ = weighted_dlt(torch.from_numpy(pixels[half]), torch.ones(len(half)))
-            off = max(
-                off,
-                float(np.nan_to_num(np.abs(map_points(other.numpy(), extent) - corners), nan=np.inf).max()),
-            )
+        halves = map(torch.from_numpy, random_halves(inliers))
+        others = [map_points(weighted_dlt(x, torch.ones(len(x)))[0].numpy(), extent) for x in halves]
+        off = float(np.nan_to_num(np.abs(np.array(others) - corners), nan=np.inf).max())
         if off > HOMOGRAPHY.most_between_halves * threshold:
             reasons.append(f"half of the inliers alone move a corner of what is matched by {off:.0f} pixels")
-    return HomographyResult("low_confidence" if reasons else "ok", tuple(reasons), H, inliers, residuals)
+    return reasons
 
 
 def map_points(H: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -108,18 +109,10 @@ def map_points(H: FloatArray, pixels: FloatArray) -> FloatArray:
 def corner_error(H: FloatArray | None, truth: FloatArray, size: tuple[int, int]) -> float:
     """Mean distance, pixels, of the four corners of an image (width, height) under H and under the truth.
 
-    Infinite without H and where H sends a corner behind the camera.
-    """
+    Infinite without H and where H sends a corner behind the camera."""
     if H is None:
         return float("inf")
     w, h = size[0] - 1.0, size[1] - 1.0
     corners = np.array([[0, 0], [w, 0], [w, h], [0, h]])
-    return float(
-        np.nan_to_num(
-            np.linalg.norm(map_points(H, corners) - map_points(truth, corners), axis=1), nan=np.inf
-        ).mean()
-    )
-
-
-def _range(values: FloatArray) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
+    apart = np.linalg.norm(map_points(H, corners) - map_points(truth, corners), axis=1)
+    return float(np.nan_to_num(apart, nan=np.inf).mean())

@@ -16,17 +16,11 @@ from geomoe3d.types import FloatArray, IntArray
 
 
 class Verdict(NamedTuple):
-    """What a network says of N matches.
+    """What a network says of N matches; GeoMoE alone has sub-fields and experts."""
 
-    Attributes:
-        logits: (N,), above 0 for inliers.
-        sub_field: (N,) the sub-field from which each match is mostly rebuilt, or None (GeoMoE alone has them).
-        expert: (N,) the expert with the largest weight for that sub-field, or None.
-    """
-
-    logits: FloatArray
-    sub_field: IntArray | None
-    expert: IntArray | None
+    logits: FloatArray  # (N,), above 0 for inliers
+    sub_field: IntArray | None  # (N,) from which each match is mostly rebuilt
+    expert: IntArray | None  # (N,) with the largest weight for that sub-field
 
     @property
     def weights(self) -> FloatArray:
@@ -35,22 +29,14 @@ class Verdict(NamedTuple):
 
 
 class ImageNetwork:
-    """GeoMoE or one of its baselines with 4D input, loaded once.
-
-    Args:
-        weights: a .safetensors file with its card beside it.
-
-    Raises:
-        CheckpointError: not found, damaged, or a network for clouds.
-    """
+    """GeoMoE or one of its baselines with 4D input, loaded once from a .safetensors file with its card beside it.
+    Raises CheckpointError: not found, damaged, or a network for clouds."""
 
     def __init__(self, weights: str | Path) -> None:
         self.model, self.card = load_network(weights)
         if self.model.config.correspondence_dim != 4:
-            raise CheckpointError(
-                f"'{weights}' holds a network for clouds; matches of images need one with 4D input, trained by "
-                "configs/train/images"
-            )
+            need = "matches of images need one with 4D input, trained by configs/train/images"
+            raise CheckpointError(f"'{weights}' holds a network for clouds; {need}")
 
     @torch.no_grad()
     def __call__(self, rays: FloatArray) -> Verdict:
@@ -60,9 +46,9 @@ class ImageNetwork:
         x = torch.from_numpy(rays).float()[None]
         neighbors = neighbors_in_batch(x, min(self.model.config.num_neighbors, len(rays)))
         out = self.model(x, None, neighbors, insight=True)
-        last = out.insights[-1] if out.insights else None
-        sub_field = None if last is None else last.sub_field[0].numpy()
-        expert = None
-        if last is not None and last.expert is not None:
-            expert = last.expert[0].numpy()[sub_field]
-        return Verdict(out.logits[-1, 0].double().numpy(), sub_field, expert)
+        logits, sub_field, expert = out.logits[-1, 0].double().numpy(), None, None
+        if out.insights:
+            last = out.insights[-1]
+            sub_field = last.sub_field[0].numpy()
+            expert = None if last.expert is None else last.expert[0].numpy()[sub_field]
+        return Verdict(logits, sub_field, expert)

@@ -2,91 +2,65 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import FormatError
-from geomoe3d.runtime.files import write_atomically
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SHOWN = 400
+KEPT, REJECTED, FAINT = "#2e9e5b", "#d1495b", "#999999"
 
 
-def save_matches(
-    path: str | Path,
+def draw_matches(
     images: tuple[NDArray[Any], NDArray[Any]],
     pixels: FloatArray,
     kept: BoolArray,
     *,
     sub_field: IntArray | None = None,
     expert: IntArray | None = None,
-    title: str = "",
-    force: bool = False,
-) -> None:
-    """Draw two images with at most 400 kept matches between them, and below the motion vectors in the first.
+) -> Figure:
+    """Two images with at most 400 kept and 400 rejected matches between them, and below motion vectors in the first.
 
     Args:
-        path: .png, .jpg, .pdf or .svg.
         images: grey, (height, width).
         pixels: (N, 4).
         kept: (N,) which are inliers.
         sub_field, expert: (N,) colours of the motion vectors, one panel each; None draws them in one colour.
-        title: above.
-        force: replace an existing file.
-
-    Raises:
-        FormatError: another suffix.
-        OutputError: the file exists and ``force`` is False, or cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    if Path(path).suffix.lower() not in SUFFIXES:
-        raise FormatError(
-            f"cannot write a picture as '{Path(path).suffix}' ('{path}'); use .png, .jpg, .pdf or .svg"
-        )
-    height = max(image.shape[0] for image in images)
-    both = np.full((height, images[0].shape[1] + images[1].shape[1]), 255, np.uint8)
-    both[: images[0].shape[0], : images[0].shape[1]] = images[0]
-    both[: images[1].shape[0], images[0].shape[1] :] = images[1]
-    fields = {"sub-field": sub_field, "expert": expert}
-    shown = {name: values for name, values in fields.items() if values is not None} or {
-        "": np.zeros(len(pixels), int)
-    }
-    figure = Figure(figsize=(14, 7 + 7 * height / both.shape[1]), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, len(shown))
+    named = {"motion vectors by sub-field": sub_field, "motion vectors by expert": expert}
+    colours = {title: values for title, values in named.items() if values is not None}
+    (height, width), other = images[0].shape, images[1].shape
+    both = np.full((max(height, other[0]), width + other[1]), 255, np.uint8)
+    both[:height, :width] = images[0]
+    both[: other[0], width:] = images[1]
+    colours = colours or {"motion vectors": np.zeros(len(pixels), int)}
+    figure = Figure(figsize=(14, 7 + 7 * both.shape[0] / both.shape[1]), layout="constrained")
+    grid = figure.add_gridspec(2, len(colours))
     axes = figure.add_subplot(grid[0, :])
     axes.imshow(both, cmap="gray", vmin=0, vmax=255)
-    axes.set_title(title or f"{kept.sum():,} of {counted(len(kept), 'match', 'matches')} kept")
-    rng = np.random.default_rng(0)
-    for rows, color, width in (
-        (np.flatnonzero(~kept), "#d1495b", 0.3),
-        (np.flatnonzero(kept), "#2e9e5b", 0.6),
-    ):
-        some = rng.permutation(rows)[:400]
-        lines = pixels[some].reshape(-1, 2, 2) + np.array([[0, 0], [images[0].shape[1], 0]])
-        axes.add_collection(LineCollection(list(lines), colors=color, linewidths=width, alpha=0.7))
+    axes.set_title(f"{kept.sum():,} of {counted(len(kept), 'match', 'matches')} kept")
     axes.set_axis_off()
-    for column, (name, values) in enumerate(shown.items()):
+    lines = pixels.reshape(-1, 2, 2)
+    rng = np.random.default_rng(0)
+    for rows, color, thickness in ((~kept, REJECTED, 0.3), (kept, KEPT, 0.6)):
+        some = lines[rng.permutation(np.flatnonzero(rows))[:SHOWN]] + [[0, 0], [width, 0]]
+        axes.add_collection(LineCollection(list(some), colors=color, linewidths=thickness, alpha=0.7))
+    for column, (title, values) in enumerate(colours.items()):
         axes = figure.add_subplot(grid[1, column])
         axes.imshow(images[0], cmap="gray", vmin=0, vmax=255, alpha=0.5)
-        axes.add_collection(
-            LineCollection(list(pixels[~kept].reshape(-1, 2, 2)), colors="#999999", linewidths=0.3)
-        )
-        drawn = LineCollection(list(pixels[kept].reshape(-1, 2, 2)), cmap="turbo", linewidths=1.0)
-        drawn.set_array(values[kept])
-        axes.add_collection(drawn)
-        axes.set_title(f"motion vectors by {name}" if name else "motion vectors")
-        axes.set_xlim(0, images[0].shape[1])
-        axes.set_ylim(images[0].shape[0], 0)
+        axes.add_collection(LineCollection(list(lines[~kept]), colors=FAINT, linewidths=0.3))
+        vectors = LineCollection(list(lines[kept]), cmap="turbo", linewidths=1.0)
+        vectors.set_array(values[kept])
+        axes.add_collection(vectors)
+        axes.set(title=title, xlim=(0, width), ylim=(height, 0))
         axes.set_axis_off()
-    kind = Path(path).suffix[1:].lower()
-    write_atomically(
-        Path(path), lambda temporary: figure.savefig(temporary, format=kind, dpi=100), force=force
-    )
+    return figure

@@ -1,10 +1,8 @@
 """From matches of two images to the relative pose, with a word on how sure it is.
 
-Matches, kept ones or all, go to an estimator: the weighted eight-point algorithm, OpenCV's five-point RANSAC or
-its MAGSAC++. Of the poses that an essential matrix allows, the one with the points before both cameras is taken.
-What two images cannot tell is looked for afterwards: a translation where the cameras only turned or hardly moved,
-a single pose where all inliers lie in one plane, agreement that chance would give as well, and whether half of the
-matches give the same pose.
+Of the poses that an essential matrix allows, the one with the points before both cameras is taken. What two images
+cannot tell is looked for afterwards: a translation where the cameras only turned or hardly moved, a single pose where
+all inliers lie in one plane, agreement that chance would give as well, and whether half of the matches agree.
 """
 
 from __future__ import annotations
@@ -27,9 +25,9 @@ from geomoe3d.geometry.essential import (
     weighted_eight_point,
 )
 from geomoe3d.geometry.se3 import make_transform, project_to_so3, rotation_error_deg
-from geomoe3d.images.cameras import Camera, opencv, rays_of
+from geomoe3d.images.cameras import Camera, opencv, rays_of, robust_estimator
 from geomoe3d.images.config import POSE
-from geomoe3d.images.features import checked
+from geomoe3d.images.features import checked, halves_of, random_halves
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 Estimator = Literal["magsac", "ransac", "eight_point"]
@@ -91,32 +89,27 @@ def find_pose(
     pixels, w = checked(pixels, weights, threshold, seed)
     if not (isinstance(cameras, Sequence) and len(cameras) == 2):
         raise InputError("two cameras are needed, (of the first image, of the second image)")
-    usable = np.isfinite(pixels).all(axis=1)
     focal = (cameras[0].focal + cameras[1].focal) / 2
     if threshold is None:
-        sides = [camera.side(pixels[usable, 2 * k : 2 * k + 2]) for k, camera in enumerate(cameras)]
-        threshold = POSE.pixel_share * focal * max(sides)
+        halves = halves_of(pixels[np.isfinite(pixels).all(axis=1)])
+        threshold = POSE.pixel_share * focal * max(c.side(x) for c, x in zip(cameras, halves, strict=True))
     rays = rays_of(pixels, cameras)
-    kept = w > 0
-    if kept.sum() < MIN_MATCHES:
-        return _failed(
-            len(pixels), f"{kept.sum()} matches are kept of {len(pixels)}; at least {MIN_MATCHES} are needed"
-        )
-    T = _estimate(rays[kept], w[kept], estimator, threshold / focal, seed)
+
+    def pose_of(rows: IntArray) -> FloatArray | None:
+        enough = len(rows) >= MIN_MATCHES
+        return _estimate(rays[rows], w[rows], estimator, threshold / focal, seed) if enough else None
+
+    kept = np.flatnonzero(w > 0)
+    T = pose_of(kept)
     if T is None:
-        return _failed(
-            len(pixels), "no essential matrix fits: the matches fix none, as where all lie on a line"
-        )
-    residuals = np.full(len(pixels), np.inf)
-    residuals[usable] = residuals_of(T, rays[usable]) * focal
-    front = np.zeros(len(pixels), dtype=bool)
-    front[usable] = before_both(T, rays[usable])
-    inliers = kept & front & (residuals < threshold)
-
-    def again(rows: IntArray) -> FloatArray | None:
-        return _estimate(rays[rows], w[rows], estimator, threshold / focal, seed)
-
-    return _judged(T, rays, inliers, residuals, kept, threshold / focal, focal, again)
+        reason = "no essential matrix fits: the matches fix none, as where all lie on a line"
+        if len(kept) < MIN_MATCHES:
+            reason = f"{len(kept)} matches are kept of {len(pixels)}; at least {MIN_MATCHES} are needed"
+        none = np.zeros(len(pixels), dtype=bool)
+        return PoseResult("failed", (reason,), None, None, none, np.full(len(pixels), np.inf))
+    residuals = np.nan_to_num(residuals_of(T, rays) * focal, nan=np.inf)
+    inliers = (w > 0) & _agrees(T, rays, threshold / focal)
+    return _judged(T, rays, inliers, residuals, kept, threshold / focal, focal, pose_of)
 
 
 def residuals_of(T: FloatArray, rays: FloatArray) -> FloatArray:
@@ -125,10 +118,10 @@ def residuals_of(T: FloatArray, rays: FloatArray) -> FloatArray:
     return np.sqrt(square.numpy() / 2)
 
 
-def before_both(T: FloatArray, rays: FloatArray) -> BoolArray:
-    """(N,) whether a match lies before both cameras."""
+def _agrees(T: FloatArray, rays: FloatArray, threshold: float) -> BoolArray:
+    """(N,) whether a match lies before both cameras and within the threshold of its epipolar lines."""
     z0, z1 = depths(torch.from_numpy(T), torch.from_numpy(rays))
-    return ((z0 > 0) & (z1 > 0)).numpy()
+    return ((z0 > 0) & (z1 > 0)).numpy() & (residuals_of(T, rays) < threshold)
 
 
 def _estimate(
@@ -138,37 +131,24 @@ def _estimate(
     if estimator == "eight_point":
         fit = weighted_eight_point(x, weights)
         return decompose(fit.E, x, weights)[0].numpy() if bool(fit.valid[0]) else None
-    cv2 = opencv()
-    if estimator not in ("ransac", "magsac"):
-        raise InputError(f"there is no estimator '{estimator}'; there are magsac, ransac and eight_point")
-    first, second = (np.ascontiguousarray(rays[:, k : k + 2]) for k in (0, 2))
-    cv2.setRNGSeed(seed)
-    method = cv2.RANSAC if estimator == "ransac" else cv2.USAC_MAGSAC
+    cv2, method = robust_estimator(estimator, seed, "eight_point")
+    given = {"prob": POSE.sureness, "threshold": threshold, "maxIters": POSE.most_samples}
     try:
-        found, _ = cv2.findEssentialMat(
-            first,
-            second,
-            np.eye(3),
-            method=method,
-            prob=POSE.sureness,
-            threshold=threshold,
-            maxIters=POSE.most_samples,
-        )
+        found, _ = cv2.findEssentialMat(*halves_of(rays), np.eye(3), method=method, **given)
     except cv2.error:  # raised where no sample gives a matrix
         return None
     if found is None or len(found) < 3 or not np.isfinite(found).all():
         return None
     # Five points alone may leave several matrices; the one that most matches agree with is meant.
-    poses = [
-        decompose(torch.from_numpy(found[k : k + 3])[None], x, weights)[0].numpy()
-        for k in range(0, len(found), 3)
-    ]
-    return max(poses, key=lambda T: int(((residuals_of(T, rays) < threshold) & before_both(T, rays)).sum()))
+    several = torch.from_numpy(found).reshape(-1, 3, 3)
+    poses = decompose(several, x.expand(len(several), -1, -1), weights.expand(len(several), -1)).numpy()
+    best: FloatArray = max(poses, key=lambda T: int(_agrees(T, rays, threshold).sum()))
+    return best
 
 
 def _judged(
-    T: FloatArray, rays: FloatArray, inliers: BoolArray, residuals: FloatArray, kept: BoolArray, threshold: float,
-    focal: float, again: Callable[[IntArray], FloatArray | None],
+    T: FloatArray, rays: FloatArray, inliers: BoolArray, residuals: FloatArray, kept: IntArray, threshold: float,
+    focal: float, pose_of: Callable[[IntArray], FloatArray | None],
 ) -> PoseResult:  # fmt: skip
     """What the inliers say of the pose."""
     found = int(inliers.sum())
@@ -177,86 +157,69 @@ def _judged(
     if found < POSE.least_inliers:
         reasons.append(f"{found} inliers; below {POSE.least_inliers} a wrong pose finds as many")
     if found >= MIN_MATCHES:
-        chance = _by_chance(T, rays[kept], threshold) * kept.sum()
+        rng, (first, second), rounds = np.random.default_rng(0), halves_of(rays[kept]), 20
+        shuffled = np.concatenate([np.hstack([first, rng.permutation(second)]) for _ in range(rounds)])
+        chance = _agrees(T, shuffled, threshold).sum() / rounds
         if found < POSE.over_chance * chance + POSE.least_inliers:
             reasons.append(
                 f"{found} inliers, where matches shuffled at random have {chance:.0f} under this pose"
             )
         x = rays[inliers]
-        parallax = float(np.median(np.linalg.norm(_turned(x) - x[:, 2:], axis=1)))
+        parallax = _beyond_rotation(x)
         if parallax < POSE.least_parallax * threshold:
             ambiguous = True
             reasons.append(
                 f"the inliers move by {parallax * focal:.1f} pixels beyond a rotation: the camera only turned, or its "
                 "way is short beside the distance of the scene; R holds, t does not"
             )
-        else:
-            alternatives = _of_a_plane(T, x, threshold)
-            if alternatives:
-                ambiguous = True
-                reasons.append("nearly all inliers lie in one plane, and a second pose explains them as well")
-            elif (off := _between_halves(T, np.flatnonzero(kept), again)) > POSE.most_between_halves_deg:
-                reasons.append(
-                    f"half of the matches alone give a pose that is off by {off:.0f} degrees; "
-                    f"{POSE.most_between_halves_deg:.0f} are allowed"
-                )
-    status: Literal["ok", "low_confidence", "ambiguous"] = "ok"
-    if reasons:
-        status = "ambiguous" if ambiguous and len(reasons) == 1 else "low_confidence"
+        elif alternatives := _of_a_plane(T, x, threshold):
+            ambiguous = True
+            reasons.append("nearly all inliers lie in one plane, and a second pose explains them as well")
+        elif (off := _between_halves(T, kept, pose_of)) > POSE.most_between_halves_deg:
+            reasons.append(
+                f"half of the matches alone give a pose that is off by {off:.0f} degrees; "
+                f"{POSE.most_between_halves_deg:.0f} are allowed"
+            )
+    status: Literal["ok", "low_confidence", "ambiguous"] = "low_confidence" if reasons else "ok"
+    if ambiguous and len(reasons) == 1:
+        status = "ambiguous"
     return PoseResult(
         status, tuple(reasons), T[:3, :3], T[:3, 3], inliers, residuals, parallax * focal, alternatives
     )
 
 
-def _between_halves(T: FloatArray, kept: IntArray, again: Callable[[IntArray], FloatArray | None]) -> float:
+def _between_halves(T: FloatArray, kept: IntArray, pose_of: Callable[[IntArray], FloatArray | None]) -> float:
     """Largest angle in degrees, of rotation or translation, between T and the poses of either half of the matches."""
-    order = np.random.default_rng(0).permutation(kept)
-    off = 0.0
-    for half in (order[::2], order[1::2]):
-        other = again(half) if len(half) >= MIN_MATCHES else None
+    truth, worst = torch.from_numpy(T), 0.0
+    for other in map(pose_of, random_halves(kept)):
         if other is None:
             return 180.0
-        off = max(
-            off, *(float(angle) for angle in pose_errors_deg(torch.from_numpy(other), torch.from_numpy(T)))
-        )
-    return off
+        worst = max(worst, *map(float, pose_errors_deg(torch.from_numpy(other), truth)))
+    return worst
 
 
-def _by_chance(T: FloatArray, rays: FloatArray, threshold: float, rounds: int = 20) -> float:
-    """Share of matches that agree with a pose after their second points were exchanged at random."""
-    rng = np.random.default_rng(0)
-    shuffled = np.concatenate([np.hstack([rays[:, :2], rng.permutation(rays[:, 2:])]) for _ in range(rounds)])
-    return float(((residuals_of(T, shuffled) < threshold) & before_both(T, shuffled)).mean())
-
-
-def _turned(x: FloatArray) -> FloatArray:
-    """First rays of matches (N, 4) under the rotation that best lays them on the second ones, (N, 2)."""
-    first, second = (np.column_stack([x[:, k : k + 2], np.ones(len(x))]) for k in (0, 2))
+def _beyond_rotation(x: FloatArray) -> float:
+    """Median distance of second rays (N, 4) from the first under the rotation that best lays these on them."""
+    first, second = (np.column_stack([half, np.ones(len(x))]) for half in halves_of(x))
     first, second = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (first, second))
     weights = np.ones(len(x))
     for _ in range(5):  # far points decide: those that the rotation alone explains
-        R = project_to_so3((second * weights[:, None]).T @ first)
-        weights = 1 / (1e-4 + np.linalg.norm(first @ R.T - second, axis=1))
-    moved: FloatArray = first @ R.T
-    return moved[:, :2] / np.maximum(moved[:, 2:], 1e-9)
+        moved = first @ project_to_so3((second * weights[:, None]).T @ first).T
+        weights = 1 / (1e-4 + np.linalg.norm(moved - second, axis=1))
+    return float(np.median(np.linalg.norm(moved[:, :2] / np.maximum(moved[:, 2:], 1e-9) - x[:, 2:], axis=1)))
 
 
 def _of_a_plane(T: FloatArray, x: FloatArray, threshold: float) -> tuple[FloatArray, ...]:
     """Poses other than T that the homography of inliers (N, 4) allows and that explain nearly all of them."""
     cv2 = opencv()
-    first, second = (np.ascontiguousarray(x[:, k : k + 2]) for k in (0, 2))
-    H, _ = cv2.findHomography(first, second, cv2.RANSAC, threshold)
+    H, _ = cv2.findHomography(*halves_of(x), cv2.RANSAC, threshold)
     if H is None:
         return ()
-    others = []
     _, turns, steps, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    others = []
     for R, t in zip(turns, steps, strict=True):
         other = make_transform(R, t[:, 0] / max(np.linalg.norm(t), 1e-12))
-        fits = (residuals_of(other, x) < threshold) & before_both(other, x)
-        if rotation_error_deg(other, T) > POSE.other_pose_deg and fits.mean() > POSE.explained:
+        explained = _agrees(other, x, threshold).mean() > POSE.explained
+        if explained and rotation_error_deg(other, T) > POSE.other_pose_deg:
             others.append(other)
     return tuple(others)
-
-
-def _failed(num: int, reason: str) -> PoseResult:
-    return PoseResult("failed", (reason,), None, None, np.zeros(num, dtype=bool), np.full(num, np.inf))

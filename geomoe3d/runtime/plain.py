@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict, is_dataclass
 from typing import Any
 
 
 def plain(value: Any) -> Any:
-    """Tuples as lists, arrays and numbers of numpy as Python's, what is not finite as None, else text."""
+    """Records as dictionaries, tuples as lists, arrays and numbers of numpy as Python's, what is not finite as None,
+    else text."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

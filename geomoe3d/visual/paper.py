@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geomoe3d.clouds.transform_files import check_suffix
+from geomoe3d.runtime.files import write_atomically
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.drawing import nice_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
+FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 INK = "#1d2129"
 SOFT = "#646b78"
 FAINT = "#d9dce2"
@@ -21,6 +29,40 @@ SIDES = {  # title: rows of the upright axes that run right and up in the panel
     "front": (0, 2),
     "side": (1, 2),
 }
+
+
+def save_figure(
+    path: str | os.PathLike[str],
+    draw: Callable[[bool], Figure],
+    *,
+    formats: tuple[str, ...] = FORMATS,
+    force: bool = False,
+    **said: str,
+) -> None:
+    """Write a figure, the same bytes each time, in the format that the suffix of ``path`` names.
+
+    Args:
+        path: the file to be written.
+        draw: makes the figure; told whether the format is one of lines (.pdf, .svg) rather than of pixels.
+        formats: suffixes that are taken.
+        force: True replaces an existing file.
+        said: what else a PDF says of itself, as Title.
+
+    Raises:
+        FormatError: the suffix is none of ``formats``.
+        OutputError: the file exists and ``force`` is False, or it cannot be written.
+    """
+    suffix = check_suffix(path, formats)
+    # A date in the file would give other bytes tomorrow.
+    metadata = {".pdf": {"CreationDate": None, **said}, ".svg": {"Date": None}}.get(suffix)
+
+    def write(temporary: Path) -> None:
+        figure = draw(suffix in (".pdf", ".svg"))
+        with warnings.catch_warnings():  # a file name in a script the font lacks shows as boxes: enough
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            figure.savefig(temporary, format=suffix[1:], dpi="figure", metadata=metadata)
+
+    write_atomically(path, write, force=force)
 
 
 def frame(axes: Axes) -> None:

@@ -8,15 +8,11 @@ the clouds.
 from __future__ import annotations
 
 import os
-import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geomoe3d.errors import FormatError
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.runtime.files import write_atomically
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.accuracy_facts import length
@@ -37,6 +33,7 @@ from geomoe3d.visual.paper import (
     bounds,
     draw_scale_bar,
     frame,
+    save_figure,
     say,
     shorten,
     show,
@@ -48,7 +45,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 MAX_POINTS = 60_000
 
 
@@ -64,20 +60,7 @@ def save_picture(view: RegistrationView, path: str | os.PathLike[str], *, force:
         FormatError: the suffix names no picture format.
         OutputError: the file exists and ``force`` is False, or it cannot be written.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in FORMATS:
-        raise FormatError(f"cannot write a picture as '{suffix}' ('{path}'); use one of {', '.join(FORMATS)}")
-
-    def write(temporary: Path) -> None:
-        vector = suffix in (".pdf", ".svg")
-        figure = draw_picture(view, fineness=2.0 if vector else 1.0)
-        # A date in the file would make the same registration give other bytes tomorrow.
-        metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(suffix)
-        with warnings.catch_warnings():  # a file name in a script the font lacks shows as boxes: enough
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            figure.savefig(temporary, format=suffix[1:], dpi="figure", metadata=metadata)
-
-    write_atomically(path, write, force=force)
+    save_figure(path, lambda vector: draw_picture(view, fineness=2.0 if vector else 1.0), force=force)
 
 
 def draw_picture(view: RegistrationView, *, fineness: float = 1.0) -> Figure:

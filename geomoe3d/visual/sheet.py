@@ -7,15 +7,11 @@ from __future__ import annotations
 
 import os
 import textwrap
-import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geomoe3d.clouds.transform_files import check_suffix
-from geomoe3d.runtime.files import write_atomically
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
@@ -29,7 +25,7 @@ from geomoe3d.visual.drawing import (
     distance_to_target,
 )
 from geomoe3d.visual.page import distance_limit, distance_reach
-from geomoe3d.visual.paper import FAINT, INK, SOFT, number, plain_axes, shorten
+from geomoe3d.visual.paper import FAINT, INK, SOFT, number, plain_axes, save_figure, shorten
 from geomoe3d.visual.picture import MAX_POINTS, draw_absent, draw_sides
 from geomoe3d.visual.view import RegistrationView
 
@@ -65,17 +61,7 @@ def save_sheet(view: RegistrationView, path: str | os.PathLike[str], *, force: b
         FormatError: another suffix.
         OutputError: the file exists and ``force`` is False, or it cannot be written.
     """
-    check_suffix(path, (".pdf",))
-
-    def write(temporary: Path) -> None:
-        figure = draw_sheet(view)
-        with warnings.catch_warnings():  # a file name in a script the font lacks shows as boxes: enough
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            figure.savefig(
-                temporary, format="pdf", dpi=_AT.dpi, metadata={"CreationDate": None, "Title": _title(view)}
-            )
-
-    write_atomically(path, write, force=force)
+    save_figure(path, lambda vector: draw_sheet(view), formats=(".pdf",), force=force, Title=_title(view))
 
 
 def draw_sheet(view: RegistrationView) -> Figure:

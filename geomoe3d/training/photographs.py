@@ -9,9 +9,8 @@ import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import make_transform
-from geomoe3d.images.check import check_truth
 from geomoe3d.images.config import KEYPOINTS
-from geomoe3d.images.pairs import ViewMatcher, pose_pairs
+from geomoe3d.images.pairs import MatchedPair, ViewMatcher, check_truth, pose_pairs
 from geomoe3d.images.scenes import read_scene
 from geomoe3d.runtime.files import new_folder
 from geomoe3d.training.pairs import TrainingPair, write_shard
@@ -21,7 +20,7 @@ def write_training_set(
     folders: Sequence[str | Path],
     out: str | Path,
     *,
-    pairs: int,
+    count: int,
     left_out: Collection[str] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int]:
@@ -30,7 +29,7 @@ def write_training_set(
     Args:
         folders: scenes, see `read_scene`.
         out: new folder, written completely or not at all.
-        pairs: at most, of each scene, see `pose_pairs`.
+        count: pairs at most, of each scene, see `pose_pairs`.
         left_out: names of scenes that are not trained on.
         progress: called with scenes done and in all.
 
@@ -57,12 +56,8 @@ def write_training_set(
                     f"the cameras of '{name}' are not those of its photographs: {found.share:.0%} of its matches lie "
                     "within 2 pixels of their epipolar lines; see 'geomoe3d data check'"
                 )
-            rows = []
-            for pair in map(ViewMatcher(), pose_pairs(scene, pairs)):
-                t = pair.T[:3, 3] / np.linalg.norm(pair.T[:3, 3])
-                T = make_transform(pair.T[:3, :3], t)
-                if len(pair.matches) >= KEYPOINTS.least_to_train:
-                    rows.append(TrainingPair(pair.rays.astype(np.float32), pair.true, T, 1.0))
+            pairs = map(ViewMatcher(), pose_pairs(scene, count))
+            rows = [_training_pair(pair) for pair in pairs if len(pair.matches) >= KEYPOINTS.least_to_train]
             if not rows:
                 raise InputError(
                     f"'{name}' has no pair of photographs turned by 3 to 60 degrees with matches"
@@ -72,3 +67,8 @@ def write_training_set(
             write_shard(place / name, rows)
             made[name] = len(rows)
     return made
+
+
+def _training_pair(pair: MatchedPair) -> TrainingPair:
+    T = make_transform(pair.T[:3, :3], pair.T[:3, 3] / np.linalg.norm(pair.T[:3, 3]))
+    return TrainingPair(pair.rays.astype(np.float32), pair.true, T, 1.0)

@@ -92,8 +92,12 @@ def align_scans(
     current = {k: np.array(poses[k]) for k in scans}
     pairs: list[Pair] = []
     asked: dict[int, IntArray] = {}
+    due, still = [0, known.neighbors_again], 0.0
     for number, reach in enumerate(known.reaches):
-        if number in (0, known.neighbors_again):
+        if reach == still:
+            continue
+        if due and number >= due[0]:
+            due.pop(0)
             pairs = sorted(overlaps.between(current, current, known.least_overlap))
             count = Counter(source for source, _ in pairs)
             asked = {k: _thinned(chosen[k], count[k]) for k in scans}
@@ -103,6 +107,8 @@ def align_scans(
         steps = _steps(levers, pulls)
         for scan, step in steps.items():
             current[scan] = _moved(current[scan], step[:3] / radius, step[3:], about[scan])
+        if max((np.linalg.norm(step) for step in steps.values()), default=0.0) < known.still * voxel_size:
+            still = reach  # further steps at this reach would change nothing
     # All may have drifted together; everything is told from where the first scan was.
     back = poses[scans[0]] @ inverse(current[scans[0]])
     return {k: back @ T for k, T in current.items()}

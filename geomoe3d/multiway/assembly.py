@@ -20,9 +20,10 @@ from geomoe3d.multiway.cycles import with_cycles
 from geomoe3d.multiway.edges import Edge, agrees
 from geomoe3d.multiway.free_space import told_by
 from geomoe3d.multiway.grouping import Growth, largest_first
+from geomoe3d.multiway.holding import loosely_held
 from geomoe3d.multiway.rules import Group, Poses
 from geomoe3d.multiway.second_thoughts import reconsidered
-from geomoe3d.multiway.settling import settle
+from geomoe3d.multiway.settling import connected_parts, settle
 from geomoe3d.multiway.survey import PairKey, Survey, key_of
 from geomoe3d.types import FloatArray
 
@@ -40,6 +41,7 @@ class Assembly:
     def __init__(self, survey: Survey) -> None:
         self._survey = survey
         self.edges: list[Edge] = []
+        self._let_go: set[int] = set()
         self._aligned: dict[tuple[tuple[int, bytes], ...], Poses] = {}
 
     def groups(self) -> list[Group]:
@@ -55,17 +57,37 @@ class Assembly:
         """
         survey = self._survey
         groups = [Group({k: np.eye(4)}) for k in range(len(survey.scans))]
+        self._let_go = set()
         for turn in range(expert().many_groups.most_turns):
-            grown = Growth(groups, self.edges, survey.shapes, survey.rules, self.witness).run()
+            grown = Growth(groups, self._usable(), survey.shapes, survey.rules, self.witness).run()
             if turn and len(grown) == len(groups):
                 break
             # Edges that bent groups together are believed more than before.
             held = {id(edge.T_target_source): edge for group in grown for edge in group.edges}
             self.edges = [held.get(id(edge.T_target_source), edge) for edge in self.edges]
-            told = self.edges, survey.shapes, survey.rules
+            told = self._usable(), survey.shapes, survey.rules
             placed = [part for group in grown for part in reconsidered(group, *told, self.witness)]
-            groups = [part for group in placed for part in settle(group, *told, self.align)]
+            groups = [part for group in placed for part in self._settled(group)]
         return largest_first(groups)
+
+    def _usable(self) -> list[Edge]:
+        """The edges but those that held a scan where it cannot be."""
+        return [edge for edge in self.edges if id(edge.T_target_source) not in self._let_go]
+
+    def _settled(self, group: Group) -> list[Group]:
+        """The group laid on its surfaces, and what let go of it, or is let go with the edges that held it."""
+        survey, parts = self._survey, []
+        for part in settle(group, self._usable(), survey.shapes, survey.rules, self.align):
+            loose = loosely_held(survey, part)
+            if not loose:
+                parts.append(part)
+                continue
+            self._let_go |= {id(e.T_target_source) for e in part.edges if loose & {e.source, e.target}}
+            parts += [Group({k: np.eye(4)}) for k in sorted(loose)]
+            kept = [e for e in part.edges if not loose & {e.source, e.target}]
+            for scans in connected_parts(part.poses.keys() - loose, kept):
+                parts += self._settled(Group({k: part.poses[k] for k in scans}))
+        return parts
 
     def _heard(self) -> list[Edge]:
         """All edges so far, with what triangles and the order of the scans say of them.

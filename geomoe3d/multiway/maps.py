@@ -40,11 +40,11 @@ class MapPair:
     members: tuple[tuple[int, ...], tuple[int, ...]]
 
 
-def members_of(anchor: int, poses: Poses, overlaps: Overlaps) -> tuple[int, ...]:
-    """The scans of the map about a scan: itself, and those of its group that overlap it most."""
+def members_of(anchor: int, poses: Poses, overlaps: Overlaps, count: int | None = None) -> tuple[int, ...]:
+    """The scans of the map about a scan, ``count`` or so many as a map has: itself, and those that overlap it most."""
     shared = {k: overlaps.of(k, anchor, inverse(poses[anchor]) @ T) for k, T in poses.items() if k != anchor}
     nearest = sorted((k for k in shared if shared[k] > 0), key=lambda k: (-shared[k], k))
-    return anchor, *nearest[: expert().many_pairs.map_scans - 1]
+    return anchor, *nearest[: (count or expert().many_pairs.map_scans) - 1]
 
 
 def map_pairs(

@@ -101,7 +101,7 @@ class SceneGroup:
         edges: those near the poses.
         loops: of its sure edges, the worst first.
         contradictions: pairs of its scans that are `ok` by themselves and would have them elsewhere, by more than any
-            bend explains; the surest first.
+            bend explains, where sensors saw through nothing; the surest first.
     """
 
     reference: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from geomoe3d.config import expert
 from geomoe3d.decision.scale import DIFFERS
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.multiway.edges import Edge, agrees, differences, expected_error, predicted_motion
+from geomoe3d.multiway.holding import is_denied
 from geomoe3d.multiway.loops import find_loops
 from geomoe3d.multiway.model import EdgeReport, LoopReport, SceneGroup, SceneModel, file_poses
 from geomoe3d.multiway.pose_graph import spanning_tree
@@ -18,6 +20,8 @@ from geomoe3d.multiway.rules import Group
 from geomoe3d.multiway.settling import is_kept
 from geomoe3d.multiway.survey import Survey, key_of
 from geomoe3d.runtime.words import counted
+
+_DENIED = "with its scans there, sensors would have seen through surfaces"
 
 
 def describe_model(
@@ -41,18 +45,22 @@ def describe_model(
     made = []
     for group in placed:
         reference, poses = file_poses(group.poses, survey.scans, origins)
+        elsewhere = [
+            k for k, one in enumerate(reports) if one[1].source in poses and _is_elsewhere(survey, *one)
+        ]
+        denied = {k for k in elsewhere if is_denied(survey, reports[k][0], group.poses)}
+        for k in denied:
+            edge, report = reports[k]
+            reports[k] = edge, replace(report, reason=f"{report.reason}; {_DENIED}")
+        heard = [edge for k, (edge, _) in enumerate(reports) if k not in denied]
         loops = tuple(
             LoopReport(tuple(names[k] for k in loop.scans), loop.shift, loop.turn_deg, loop.closes)
-            for loop in find_loops(group.poses, edges, survey.shapes, survey.voxel_size)
+            for loop in find_loops(group.poses, heard, survey.shapes, survey.voxel_size)
         )
-        elsewhere = [
-            report
-            for edge, report in reports
-            if report.source in poses and _is_elsewhere(survey, edge, report)
-        ]
-        elsewhere.sort(key=lambda report: -report.confidence)
+        contradictions = [reports[k][1] for k in elsewhere if k not in denied]
+        contradictions.sort(key=lambda report: -report.confidence)
         made.append(
-            SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops, tuple(elsewhere))
+            SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops, tuple(contradictions))
         )
     unplaced = {
         names[k]: faults.get(k) or _why_unplaced(survey, edges, k) for k in range(len(names)) if k not in home

@@ -92,9 +92,9 @@ def test_where_another_place_would_be_ok_by_itself_none_is(rooms, scan, monkeypa
 def test_where_one_place_fits_plainly_only_windows_of_rivals_are_looked_into(house, scan, monkeypatch):
     looked = []
 
-    def motions(self, window, count, *, more=False, _made=Query.motions):
+    def motions(self, window, count, *, _made=Query.motions, **how):
         looked.append(window.votes)
-        return _made(self, window, count, more=more)
+        return _made(self, window, count, **how)
 
     monkeypatch.setattr(Query, "motions", motions)
     assert house.locate(scan[0]).ok

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from geomoe3d.clouds.voxel_grid import by_voxel, drop_duplicates, num_different, voxel_keys, voxel_means
@@ -37,16 +39,16 @@ def round_size(size: float) -> float:
 
 def own_voxel_sizes(source: PointCloud, target: PointCloud, num_points: int) -> tuple[float, float]:
     """The voxel size that each of two clouds would get by itself, see `choose_voxel_size`; not rounded."""
-
-    def of(cloud: PointCloud) -> float:
-        size, least = _size_for_count(cloud.points, num_points), 2.0 * typical_spacing(cloud.points)
-        # Where foliage fills space, a grid for surfaces shows next to nothing of it.
-        return max(size / 2 if size > least and _fills_space(cloud.points, size) else size, least)
-
     if source is target:
-        return (size := of(source)), size
-    first, second = each(of, (source, target))
+        (size,) = _own_sizes(source, (num_points,))
+        return size, size
+    (first,), (second,) = each(lambda cloud: _own_sizes(cloud, (num_points,)), (source, target))
     return first, second
+
+
+def voxel_sizes_of(cloud: PointCloud, *num_points: int) -> tuple[float, ...]:
+    """`choose_voxel_size` of one cloud for several numbers of points; what they have in common is measured once."""
+    return tuple(round_size(size) for size in _own_sizes(cloud, num_points))
 
 
 def robust_extent(points: FloatArray) -> float:
@@ -61,7 +63,7 @@ def robust_extent(points: FloatArray) -> float:
 def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float, max_points: int) -> float:
     """The given size, or the next larger at which neither cloud occupies more than ``max_points`` voxels.
     Raises InputError: a voxel so small that the grid's indices overflow."""
-    for cloud in (source, target):
+    for cloud in (source,) if source is target else (source, target):
         while (occupied := num_different(voxel_keys(cloud.points, voxel_size, OFF_ROUND))) > max_points:
             # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
             voxel_size *= expert().preparation.coarsening * float(np.sqrt(occupied / max_points))
@@ -83,6 +85,18 @@ def scale_mismatch(source: PointCloud, target: PointCloud) -> str | None:
         f"'{target.name}' {extents[1]:.4g}; at most {most} is taken): one is probably in "
         "millimetres and the other in metres; bring both to one unit, a rigid transform cannot change scale"
     )
+
+
+def _own_sizes(cloud: PointCloud, counts: Sequence[int]) -> list[float]:
+    """What a cloud would get by itself for each number of points."""
+    least = 2.0 * typical_spacing(cloud.points)
+
+    def of(num_points: int) -> float:
+        size = _size_for_count(cloud.points, num_points)
+        # Where foliage fills space, a grid for surfaces shows next to nothing of it.
+        return max(size / 2 if size > least and _fills_space(cloud.points, size) else size, least)
+
+    return [of(num_points) for num_points in counts]
 
 
 def _size_for_count(points: FloatArray, num_points: int) -> float:

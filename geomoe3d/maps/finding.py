@@ -15,7 +15,7 @@ import numpy as np
 
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.clouds.viewpoint import find_viewpoints, seen_by_none
-from geomoe3d.clouds.voxel_size import bounded_voxel_size, choose_voxel_size
+from geomoe3d.clouds.voxel_size import bounded_voxel_size, voxel_sizes_of
 from geomoe3d.config import expert
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError
@@ -146,11 +146,12 @@ class Finder:
     def _grids(self, cloud: PointCloud) -> tuple[float, float]:
         """Edges of the grid that suits a scan, and of the coarsest one that serves it."""
         preparation, given = self.line.config.preparation, self.line.config.voxel_size
-        own = given or choose_voxel_size(cloud, cloud, preparation.voxel_points)
-        own = bounded_voxel_size(cloud, cloud, own, preparation.max_points)
         if given is not None:
+            own = bounded_voxel_size(cloud, cloud, given, preparation.max_points)
             return own, expert().maps.finer * own
-        return own, max(own, choose_voxel_size(cloud, cloud, expert().maps.least_voxels))
+        own, coarsest = voxel_sizes_of(cloud, preparation.voxel_points, expert().maps.least_voxels)
+        own = bounded_voxel_size(cloud, cloud, own, preparation.max_points)
+        return own, max(own, coarsest)
 
     def _begun(
         self,
@@ -182,7 +183,7 @@ class Finder:
         if self.line.config.voxel_size is not None:
             return None
         was, finer = search.level.voxel_size, expert().maps.finer
-        sought = max(own, choose_voxel_size(cloud, cloud, expert().maps.sought_voxels))
+        sought = max(own, *voxel_sizes_of(cloud, expert().maps.sought_voxels))
         if max(sought / was, was / sought) <= finer:
             return None
         level = self.level_for(sought, finer * sought, expert().maps.most_points)

@@ -10,8 +10,9 @@ those of the map did.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,10 +31,12 @@ from geomoe3d.maps.places import Query, Window
 from geomoe3d.maps.sight import Sight, seen_factor
 from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
-from geomoe3d.runtime.threads import single_blas_thread
+from geomoe3d.runtime.threads import beside, each, single_blas_thread, usable_threads
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 ANOTHER_STANDS = (
     "at another place the scan would be ok too, were it not for this one: rooms may be copies of each other"
 )
@@ -140,12 +143,17 @@ class Search:
                 break
             if all(self.differ(hypothesis, other) for _, other in chosen):
                 chosen.append((score, hypothesis))
-        polished = [
-            Hypothesis(self._polished(h.T_target_source))
+        worth = [
+            h.T_target_source
             for score, h in chosen[: math.ceil(times * known.polished[more])]
             if score >= known.worth_polishing * chosen[0][0]
         ]
-        both = [*chosen, *((self._quick(h.T_target_source), h) for h in polished)]
+
+        def closer(T: FloatArray) -> tuple[float, Hypothesis]:
+            T = self._polished(T)
+            return self._quick(T), Hypothesis(T)
+
+        both = [*chosen, *each(closer, worth)]
         best: list[tuple[float, Hypothesis]] = []
         for score, hypothesis in sorted(both, key=lambda item: -item[0]):
             if all(self.differ(hypothesis, other) for _, other in best):
@@ -173,15 +181,19 @@ class Search:
         query = Query(part.take(np.sort(drawn)), level, seed=self.config.seed)
         own, place = self._quick(T), Hypothesis(T)
         least, worth = known.close * own, known.worth_polishing * own
-        found: list[tuple[float, Hypothesis]] = []
-        for window in _likest(windows, center, self.reach):
-            moved = [Hypothesis(h.T_target_source @ T) for h in query.motions(window, 3)]
+
+        def sought(window: Window) -> tuple[float, Hypothesis] | None:
+            moved = [Hypothesis(h.T_target_source @ T) for h in query.motions(window, 3, mutual=True)]
             # Windows that reach the place hold its own points, too.
             moved = [h for h in moved if self.differ(place, h)]
-            if moved and self._quick(moved[0].T_target_source, worth) > worth:
-                twin = self._polished(moved[0].T_target_source)
-                found.append((self._quick(twin, least), Hypothesis(twin)))
-        found = [(score, h) for score, h in found if score > least]
+            if not moved or self._quick(moved[0].T_target_source, worth) <= worth:
+                return None
+            twin = self._polished(moved[0].T_target_source)
+            score = self._quick(twin, least)
+            return (score, Hypothesis(twin)) if score > least else None
+
+        likest = each(sought, _likest(windows, center, self.reach))
+        found = [twin for twin in likest if twin is not None]
         distinct: list[Hypothesis] = []
         for _, h in sorted(found, key=lambda item: -item[0]):
             if len(distinct) < count and all(self.differ(h, other) for other in distinct):
@@ -205,6 +217,7 @@ class Search:
         # What was known before did not convince, or it would not be asked again.
         plain = max([known.plain, *(known.better * score for score, _ in scored)]) if more else known.plain
         found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
+        motions = _ahead(lambda w: self._query.motions(w, known.per_window[more], more=more), windows)
         for number, window in enumerate(windows):
             if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
                 break
@@ -212,7 +225,7 @@ class Search:
                 break
             if found is not None and np.linalg.norm(window.center - found[1]) < self._query.radius:
                 continue
-            proposed = self._query.motions(window, known.per_window[more], more=more)
+            proposed = motions(number)
             if near is not None:
                 proposed = [h for h in proposed if self.is_near(h.T_target_source, near)]
             least = known.worth_polishing * max((q for q, _ in scored), default=0.0)
@@ -376,6 +389,23 @@ def _likest(windows: Sequence[Window], center: FloatArray, reach: float) -> list
         some = [w for w, d in zip(windows, away, strict=True) if low <= d < high]
         chosen += [w for w in some if w.votes >= known.twin_share * some[0].votes][: known.twin_windows]
     return chosen
+
+
+def _ahead(function: Callable[[Item], Result], items: Sequence[Item]) -> Callable[[int], Result]:
+    """What gives ``function`` of an item by its number; that of the next one is made beside it, where a thread is idle:
+    it is wanted as a rule."""
+    made: dict[int, Result] = {}
+
+    def of(number: int) -> Result:
+        if number not in made:
+            if number + 1 < len(items) and usable_threads() > 1:
+                this, following = items[number], items[number + 1]
+                made[number], made[number + 1] = beside(lambda: function(this), lambda: function(following))
+            else:
+                made[number] = function(items[number])
+        return made[number]
+
+    return of
 
 
 def _score(candidate: tuple[float, Hypothesis]) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,8 +29,8 @@ from geomoe3d.types import (
     IntArray,
 )
 
-_ROWS = 50
-"""Points of the scan whose similarities to all of the map are held at once."""
+_ROWS = 4000
+"""Points of the map whose similarities to the scan's are held at once: they stay near a core."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +50,15 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """What is compared of a map, cell by cell: its rows in that order, where each cell begins, which cells make the
-    window around each, and the features (65, c) in that order."""
+    """What is compared of a map, cell by cell: its rows in that order, where each cell begins, and the features (c, 65)
+    in that order; and of the window around each of w cells: the cells of all windows, one after another, where each
+    window begins and ends there (w + 1), and its centre (w, 3)."""
 
     order: IntArray
     starts: IntArray
-    members: list[list[int]]
+    members: IntArray
+    windows: IntArray
+    centers: FloatArray
     features: Float32Array
 
 
@@ -95,33 +99,30 @@ class Query:
         limit = min(expert().places.voting, expert().places.most_votes // max(len(level.features), 1))
         voters = self._scan.features if voters is None else voters
         asked = voters[:: math.ceil(len(voters) / max(limit, 1))]
-        best = np.concatenate(
-            each(
-                lambda start: np.maximum.reduceat(
-                    asked[start : start + _ROWS] @ cells.features, cells.starts, axis=1
-                ),
-                range(0, len(asked), _ROWS),
-            )
-        )
-        by_cell = np.ascontiguousarray(best.T)
-        most = np.stack([by_cell[m].max(0) for m in cells.members], axis=1)  # (asked, windows)
-        votes = _votes(most)
-        counts = np.add.reduceat(np.ones(len(cells.order)), cells.starts)
-        sums = np.add.reduceat(level.points[cells.order], cells.starts, axis=0)
         ends = np.append(cells.starts[1:], len(cells.order))
+        edges = np.searchsorted(cells.starts, np.arange(0, len(cells.order), _ROWS))
+        blocks = np.unique(np.append(edges, len(cells.starts)))
+
+        def best_of(block: tuple[int, int]) -> Float32Array:
+            first, last = cells.starts[block[0]], ends[block[1] - 1]
+            begins = cells.starts[slice(*block)] - first
+            alike = asked @ cells.features[first:last].T
+            return np.ascontiguousarray(np.maximum.reduceat(alike, begins, axis=1).T)
+
+        best = np.concatenate(each(best_of, list(pairwise(blocks.tolist()))))
+        votes = _votes(np.maximum.reduceat(best[cells.members], cells.windows[:-1]).T)
         apart = expert().places.apart * self.radius
+        likely = np.argsort(-votes, kind="stable")
+        if within is not None:
+            away = np.linalg.norm(cells.centers[likely] - within[0], axis=1)
+            likely = likely[away <= within[1] + self.radius]
         found: list[Window] = []
-        for k in np.argsort(-votes, kind="stable"):
-            if len(found) == count:
-                break
-            m = cells.members[k]
-            center = sums[m].sum(0) / counts[m].sum()
-            if within is not None and np.linalg.norm(center - within[0]) > within[1] + self.radius:
-                continue
-            if any(np.linalg.norm(center - window.center) < apart for window in found):
-                continue
-            keys = np.concatenate([cells.order[cells.starts[j] : ends[j]] for j in m])
+        while len(likely) and len(found) < count:
+            k, likely = int(likely[0]), likely[1:]
+            center, held = cells.centers[k], cells.members[cells.windows[k] : cells.windows[k + 1]]
+            keys = np.concatenate([cells.order[cells.starts[j] : ends[j]] for j in held])
             found.append(Window(center, np.sort(keys), float(votes[k])))
+            likely = likely[np.linalg.norm(cells.centers[likely] - center, axis=1) >= apart]
         return found
 
     @cached_property
@@ -136,25 +137,35 @@ class Query:
         order = np.argsort(flat, kind="stable")
         starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
         places = np.stack(np.unravel_index(flat[order][starts], shape), axis=1)
-        members = cKDTree(places).query_ball_point(
+        around = cKDTree(places).query_ball_point(
             places, expert().places.window * self.radius / edge + 1e-6, return_sorted=True
         )
-        return _Cells(order, starts, list(members), np.ascontiguousarray(level.features[order].T))
+        members = np.concatenate(around).astype(np.int64)
+        windows = np.cumsum([0, *map(len, around)])
+        counts = np.diff(np.append(starts, len(order)))
+        sums = np.add.reduceat(level.points[order], starts, axis=0)
+        counted = np.add.reduceat(counts[members], windows[:-1])[:, None]
+        centers = np.add.reduceat(sums[members], windows[:-1], axis=0) / counted
+        return _Cells(order, starts, members, windows, centers, level.features[order])
 
-    def motions(self, window: Window, count: int, *, more: bool = False) -> list[Hypothesis]:
+    def motions(
+        self, window: Window, count: int, *, more: bool = False, mutual: bool = False
+    ) -> list[Hypothesis]:
         """Motions into a window, best first, T_map_scan (4, 4) local coordinates of both.
 
         Args:
             window: where to.
             count: at most so many.
             more: from more matches and seeds: two to four times as long, and more is found.
+            mutual: from matches alone that are each other's best: a third of the time, enough for what is alike.
         """
         scan, there, known = self._scan, self.level.compared.take(window.keys), expert().places
         # A small scan has few points to match, and of their first choices too few are right.
-        choices = min(known.choices, math.ceil(known.matches[more] / len(scan.points)))
-        index, distance, _, mutual = nearest_features(scan.features, there.features, choices, False)
-        order = np.lexsort((distance.ravel(), ~mutual.ravel()))[: known.matches[more]]
-        rows, columns, first = order // index.shape[1], index.ravel()[order], mutual.ravel()[order]
+        choices = 1 if mutual else min(known.choices, math.ceil(known.matches[more] / len(scan.points)))
+        index, distance, _, both = nearest_features(scan.features, there.features, choices, False)
+        most = min(known.matches[more], np.count_nonzero(both)) if mutual else known.matches[more]
+        order = np.lexsort((distance.ravel(), ~both.ravel()))[:most]
+        rows, columns, first = order // index.shape[1], index.ravel()[order], both.ravel()[order]
         matched = Correspondences(
             np.hstack([scan.points[rows], there.points[columns]]),
             normals=(scan.normals[rows], there.normals[columns]),

@@ -51,6 +51,10 @@ def test_paths_are_relative_to_the_table_and_ids_are_made_where_missing(tmp_path
         ("id,source,target\n../../evil,a,b\n", InputError, "line 2: the id '../../evil' cannot name files"),
         ("id,source,target\nx,a,b\n.x,a,c\n", InputError, "line 3: the id '.x' .* must not begin with a dot"),
         ("id,source,target\na/../b,a,b\n", InputError, "nor hold the part '..'"),
+        ('source,target\na,b\n"c,d\n', FormatError, "line 3: a cell begins with a quote that is not closed"),
+        ('source,target\n"a,b\nc",d\n', FormatError, "line 3: a cell begins with a quote that is not closed"),
+        ('source,target\n"a"b,c\n', FormatError, "line 2: a cell begins with a quote that is not closed"),
+        ('source,"target\na,b\n', FormatError, "a cell begins with a quote that is not closed"),
         ("source,target\na,b\na,1.ply,b\n", FormatError, "line 3 has more cells than the 2 .* 'b'; put"),
     ],
 )

@@ -212,6 +212,11 @@ def test_clouds_that_fix_nothing_are_refused(points: np.ndarray, message: str) -
         check_cloud(PointCloud(points, origin=np.array([1000.0, 0, 0]), name="empty"))
 
 
+def test_a_cloud_too_small_for_its_squares_is_refused() -> None:
+    with pytest.raises(InputError, match=r"'tiny' is 1e-300 long at most, under the limit of 1e-15; use a smaller"):
+        check_cloud(PointCloud(np.eye(3) * 1e-300, name="tiny"))
+
+
 def test_any_three_points_that_differ_pass_the_first_check() -> None:
     check_cloud(PointCloud(np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 1e-12]])))
 

@@ -70,17 +70,14 @@ def test_beside_with_one_thread_is_one_after_the_other(monkeypatch):
 @pytest.mark.parametrize("threads_used", ["1", "3"])
 def test_a_failure_of_the_first_comes_before_one_of_the_second(monkeypatch, threads_used):
     monkeypatch.setenv("OMP_NUM_THREADS", threads_used)
-    ended = []
 
     def fail(error):
-        ended.append(error)
         raise error
 
     with pytest.raises(KeyError):
         beside(lambda: fail(KeyError()), lambda: fail(ValueError()))
     with pytest.raises(ValueError):
         beside(lambda: None, lambda: fail(ValueError()))
-    assert isinstance(ended[-1], ValueError)
 
 
 def test_many_callers_share_the_helpers(three_threads):

@@ -31,6 +31,7 @@ MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range
 _COLUMNS = ("source", "target", "id", "initial", *MATRIX_COLUMNS)
 
 PairLike = Sequence[Any]
+_OPEN_QUOTE = 'a cell begins with a quote that is not closed before the next separator; close it, or write "" for a quote'
 _EXPECTED = "(source, target) or (source, target, first guess)"
 
 
@@ -85,13 +86,13 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
         raise cannot_read(error, f"cannot read '{path}': {error.strerror}") from None
     head = text.partition("\n")[0]
     separator = max(",;\t", key=head.count)
-    reader = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
-    columns = [name.strip() for name in reader.fieldnames or []]
-    reader.fieldnames = columns
-    _check_columns(path, columns)
+    reader = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True, strict=True)
     folder = path.parent.resolve()
     rows, lines = [], []
     try:
+        columns = [name.strip() for name in reader.fieldnames or []]
+        reader.fieldnames = columns
+        _check_columns(path, columns)
         for cells in reader:
             where = f"'{path}' line {reader.line_num}"
             surplus = [cell for cell in cells.pop(None, []) if cell.strip()]
@@ -101,11 +102,13 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
                     f"of them '{surplus[0]}'; put a cell that holds the separator '{separator}' in quotes"
                 )
             values = {key: (cells[key] or "").strip() for key in columns}
+            if any("\n" in value for value in values.values()):
+                raise FormatError(f"{where}: {_OPEN_QUOTE}")
             if any(values.values()):
                 rows.append(_row(values, folder, where))
                 lines.append(where)
     except csv.Error as error:
-        raise FormatError(f"'{path}' line {reader.line_num}: {error}") from None
+        raise FormatError(f"'{path}' line {reader.reader.line_num}: {_OPEN_QUOTE} ({error})") from None
     return check_rows(rows, lines, str(path))
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from geomoe3d.clouds.viewpoint import guess_viewpoint
 from geomoe3d.clouds.voxel_grid import drop_duplicates, drop_isolated, voxel_means
-from geomoe3d.config import PreparationConfig
-from geomoe3d.errors import EmptyCloudError
+from geomoe3d.config import PreparationConfig, expert
+from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.columns import extents
 from geomoe3d.runtime.open3d_core import open3d_core
 from geomoe3d.runtime.words import counted
@@ -79,15 +79,21 @@ def prepare(
 
 
 def check_cloud(cloud: PointCloud) -> None:
-    """Refuse a cloud that cannot fix a rigid motion whatever the other one is. Raises EmptyCloudError: fewer
-    than 3 points, or all points equal."""
+    """Refuse a cloud that cannot fix a rigid transform whatever the other one is. Raises EmptyCloudError: fewer
+    than 3 points, or all points equal; InputError: an extent under `expert.loading.least_extent`."""
     if len(cloud) < _MIN_POINTS:
         held = f"'{cloud.name}' holds {counted(len(cloud), 'point')}"
         raise EmptyCloudError(f"{held}; a rigid transform needs at least {_MIN_POINTS}")
-    if not extents(cloud.points).any():
+    extent = float(extents(cloud.points).max())
+    if not extent:
         raise EmptyCloudError(
             f"'{cloud.name}': all {len(cloud)} points are equal to {cloud.file_points[0].tolist()}; "
             "they fix no rotation"
+        )
+    limit = expert().loading.least_extent
+    if extent < limit:
+        raise InputError(
+            f"'{cloud.name}' is {extent:.3g} long at most, under the limit of {limit:g}; use a smaller unit"
         )
 
 

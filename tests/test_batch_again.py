@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import time
@@ -98,6 +99,21 @@ def test_a_gltf_is_another_one_when_its_buffer_changes(tmp_path):
     assert found[1] == found[3] and len(set(found)) == 3
     (tmp_path / "a.gltf").write_text("damaged")
     assert row.fingerprint(contents.Contents()) not in found
+
+
+def test_a_glb_with_a_buffer_beside_it_is_another_one_when_that_changes(tmp_path):
+    document = json.dumps(
+        {"asset": {"version": "2.0"}, "buffers": [{"uri": "b.bin", "byteLength": 3}]}
+    ).encode()
+    document += b" " * (-len(document) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(document), len(document), 0x4E4F534A)
+    (tmp_path / "a.glb").write_bytes(head + document)
+    row = PairRow("1", str(tmp_path / "a.glb"), str(tmp_path / "none.ply"))
+    found = []
+    for text in ("one", "two", "one"):
+        (tmp_path / "b.bin").write_text(text)
+        found.append(row.fingerprint(contents.Contents()))
+    assert found[0] == found[2] != found[1]
 
 
 def test_killed_in_the_middle_it_goes_on_and_nothing_is_done_twice(scans, tmp_path):

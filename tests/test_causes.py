@@ -11,6 +11,7 @@ from surface_pairs import motion
 
 import geomoe3d
 from geomoe3d.clouds.loading import load_points, without_missing
+from geomoe3d.clouds.viewpoint import with_sensor
 from geomoe3d.config import PreparationConfig
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.answer import Decision
@@ -48,6 +49,17 @@ def test_numbers_that_stand_for_no_measurement_are_named(number: float, axis: in
     said, *_ = data_remarks(clouds, 0.25, PreparationConfig())
     assert said.startswith(f"'bad.ply': 7 points have the {'xyz'[axis]} {number:.0f}, which stands for no")
     assert not any("measurement" in s for s in data_remarks(clouds[1:] * 2, 0.25, PreparationConfig()))
+
+
+def test_a_sensor_said_to_stand_far_away_is_named() -> None:
+    points = np.random.default_rng(0).normal((1000.0, 0, 0), size=(500, 3))
+    far, near = (
+        with_sensor(load_points(points, name="scan"), place, "auto")
+        for place in ((0.0, 0, 0), (1003.0, 0, 0))
+    )
+    said, *_ = data_remarks((far, near), 0.25, PreparationConfig())
+    assert said.startswith("the sensor of 'scan' is said to have stood 999.9 from it")
+    assert not any("sensor" in s for s in data_remarks((near, near), 0.25, PreparationConfig()))
 
 
 def test_a_voxel_size_far_from_the_usual_one_is_named() -> None:

@@ -213,7 +213,9 @@ def test_clouds_that_fix_nothing_are_refused(points: np.ndarray, message: str) -
 
 
 def test_a_cloud_too_small_for_its_squares_is_refused() -> None:
-    with pytest.raises(InputError, match=r"'tiny' is 1e-300 long at most, under the limit of 1e-15; use a smaller"):
+    with pytest.raises(
+        InputError, match=r"'tiny' is 1e-300 long at most, under the limit of 1e-15; use a smaller"
+    ):
         check_cloud(PointCloud(np.eye(3) * 1e-300, name="tiny"))
 
 

@@ -35,10 +35,10 @@ class Contents:
         self._changed = False
 
     def of(self, path: str) -> str | None:
-        """A hash of a file's bytes, and of the files that hold the buffers of a .gltf; None of one that cannot be
+        """A hash of a file's bytes, and of the files that hold the buffers of a glTF; None of one that cannot be
         read."""
         own = self._of_one(path)
-        beside = _buffers(Path(path)) if own and path.lower().endswith(".gltf") else []
+        beside = _buffers(Path(path)) if own and path.lower().endswith((".gltf", ".glb")) else []
         if not beside:
             return own
         return hashlib.sha256(json.dumps([own, *map(self._of_one, beside)]).encode()).hexdigest()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.clouds.viewpoint import may_have_seen
 from geomoe3d.clouds.voxel_size import choose_voxel_size
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.decision.confidence import Judgement
@@ -68,10 +69,11 @@ def data_remarks(
 ) -> Iterator[str]:
     """Causes, in the clouds as loaded, of an answer that is not ok; arguments as `remarks`.
 
-    Numbers that are no measurements, and a voxel size far from the one that would be chosen.
+    Numbers that are no measurements, sensors given far away, and a voxel size far from the one that would be chosen.
     """
     for loaded in clouds:
         yield from _no_data(loaded)
+        yield from _far_sensor(loaded)
     usual = choose_voxel_size(*clouds, config.voxel_points)
     most = expert().remarks.unusual_size
     if not 1 / most < wanted / usual < most:
@@ -92,6 +94,19 @@ def _no_data(cloud: PointCloud) -> Iterator[str]:
                     f"'{cloud.name}': {count:,} points have the {name} {number:.0f}, which stands for no measurement "
                     "in many programs; remove them"
                 )
+
+
+def _far_sensor(cloud: PointCloud) -> Iterator[str]:
+    """A sentence where the user gave a sensor a place from which the cloud looks small."""
+    if not cloud.sensor_given or cloud.sensor is None:
+        return
+    place = cloud.sensor - cloud.origin
+    if not may_have_seen(cloud.points, place):
+        away = float(np.linalg.norm(place - cloud.points.mean(axis=0)))
+        yield (
+            f"the sensor of '{cloud.name}' is said to have stood {away:.4g} from it, more than the cloud is long; is "
+            "the place in the coordinates of the file?"
+        )
 
 
 def flatness(name: str, points: FloatArray) -> str | None:

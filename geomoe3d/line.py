@@ -28,8 +28,9 @@ from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.information import distance_under
 from geomoe3d.decision.parallel import made_parallel
 from geomoe3d.decision.remarks import data_remarks, remarks
+from geomoe3d.decision.repeat import joined
 from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
-from geomoe3d.decision.selection import Selection, surfaces_of
+from geomoe3d.decision.selection import Selection, are_different, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
 from geomoe3d.geometry.se3 import inverse
@@ -116,6 +117,8 @@ class Line:
         sides: Sides = "centroid" if seen_by_none(clouds) else "sensor"
         prepared = self.pipeline.prepare_both(clouds, voxel_size, places or (None, None), clock, sides)
         look = self._best(clouds, prepared, places, sides)
+        if self._is_sought_again(look):
+            look = self._sought_again(look, clouds, places, sides)
         clock("decide")
         decision, agreeing = look.decision, self._mirrored_agreement(prepared, places)
         asks_mirrored = config.second_look.mirror and self.again is not None
@@ -161,6 +164,31 @@ class Line:
             if surer and (sides == "flipped" or sure):
                 best = other
         return best
+
+    def _is_sought_again(self, look: Look) -> bool:
+        """Whether an answer is to be found once more, on a shifted grid."""
+        if self.again is None or self.given is not None or not self.pipeline.scorers:
+            return False  # that is not asked, or nothing would be other
+        below, judgement = self.config.second_look.repeat_below, look.decision.judgement
+        unsure = judgement.confidence < below or (below > 0 and self._may_be_wrong(look.pair, look.decision))
+        return unsure and judgement.status != "failed"
+
+    def _sought_again(
+        self, look: Look, clouds: tuple[PointCloud, PointCloud], places: Places, sides: Sides
+    ) -> Look:
+        """The surer of a look and another one on a shifted grid, judged by both."""
+        line = replace(self, pipeline=self.pipeline.on_another_grid())
+        size = look.pair.voxel_size
+        prepared = line.pipeline.prepare_both(clouds, size, places or (None, None), self.clock, sides)
+        other = line._best(clouds, prepared, places, sides)
+        if other.decision.answer is None:
+            return look
+        shift = expert().selection.different_shift * look.pair.inlier_threshold
+        found = look.decision.T_target_source, other.decision.T_target_source
+        agree = not are_different(*found, look.pair.clouds[0], shift)
+        least = max(self.config.decision.min_confidence, self.config.second_look.repeat_min_confidence)
+        decision, taken = joined(look.decision, other.decision, agree, least)
+        return (other if taken else look)._replace(decision=decision)
 
     def _mirrored_agreement(self, prepared: Clouds, places: Places) -> Callable[[], float]:
         """Which share of matches of the mirrored source the best of a few motions brings together; asked once."""
@@ -259,16 +287,18 @@ class Line:
         return Look(pair, weighed, decision, shared)
 
     def _is_described_again(self, pair: Pair, decision: Decision) -> bool:
-        """Whether the second descriptor is to be asked: of an answer that is not ok, or is by little and has a rival or
-        few matches that agree."""
-        known = self.pipeline.second_descriptor is not None and bool(self.pipeline.scorers)
+        """Whether the second descriptor is to be asked: of an answer that is not ok, or may be wrong all the same."""
+        if self.pipeline.second_descriptor is None or not self.pipeline.scorers or self.once:
+            return False
         asked = have_margin(self.pipeline.second_scorers)
-        least = self.config.second_look.checked_below if asked else 0.0
-        doubtful = decision.judgement.status != "ok"
-        if decision.judgement.confidence < least:
-            limits, agreeing = expert().confidence, decision.residuals(pair.matched) < pair.inlier_threshold
-            doubtful |= decision.lead < limits.most_lead or int(agreeing.sum()) < limits.plain_matches
-        return known and doubtful and not self.once
+        return decision.judgement.status != "ok" or (asked and self._may_be_wrong(pair, decision))
+
+    def _may_be_wrong(self, pair: Pair, decision: Decision) -> bool:
+        """Whether an answer that is ok is so by little, and has a rival or few matches that agree."""
+        if decision.judgement.confidence >= self.config.second_look.checked_below:
+            return False
+        limits, agreeing = expert().confidence, decision.residuals(pair.matched) < pair.inlier_threshold
+        return decision.lead < limits.most_lead or int(agreeing.sum()) < limits.plain_matches
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import reduce
 from typing import Any, Literal
@@ -144,6 +145,16 @@ class Pipeline:
         clock("features")
         first, second = (with_features(cloud, self.descriptor) for cloud in made)
         return first, second
+
+    def on_another_grid(self) -> Pipeline:
+        """The same parts, on a shifted grid and with other draws."""
+        step, config, other = expert().repeat, self.config, copy(self)
+        shift = (config.preparation.grid_shift + step.shift) % 1
+        preparation = config.preparation.model_copy(update={"grid_shift": shift})
+        other.config = config.model_copy(
+            update={"preparation": preparation, "seed": config.seed + step.seed_step}
+        )
+        return other
 
     def match(
         self, clouds: Clouds, places: Places, clock: StageClock, limit: int | None = None, draw: int = 0

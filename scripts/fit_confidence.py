@@ -1,7 +1,7 @@
 """Fits the confidence: P(the answer is right) as a logistic function of what the clouds say of it.
 
     python scripts/fit_confidence.py FOLDER... [--pairs 500] [--unrelated 250] [--set scoring.scorers=[surfaces]]
-        [--set preparation.viewpoint=centroid] [--second-look] [--out runs/confidence.jsonl]
+        [--set preparation.viewpoint=centroid] [--second-look | --repeat] [--out runs/confidence.jsonl]
 
 FOLDER: posed fragments that are not those of a benchmark, nor of the network's training (generated rooms,
 recordings of one's own). Pairs are drawn by overlap as the two benchmarks mix them, unrelated ones from
@@ -10,7 +10,8 @@ look and always with one, since the confidence decides about it; the outcomes go
 not done again: give another OUT for other weights or code. Prints coefficients for
 `geomoe3d/decision/confidence.py`, cross-validated over scenes. With --second-look every pair is registered as users
 do, twice as many pairs of little overlap are drawn, and the fit is that of answers which the surface network was asked
-about: of what the fit of the evidence says and of the network's margin. Needs scikit-learn, which the package itself
+about: of what the fit of the evidence says and of the network's margin. With --repeat it is that of answers which came
+out again on a shifted grid, of the mean of both logits. Needs scikit-learn, which the package itself
 does not.
 """
 
@@ -34,6 +35,7 @@ from geomoe3d.decision.confidence import (
     margin_inputs,
 )
 from geomoe3d.decision.information import Information
+from geomoe3d.decision.repeat import logit
 from geomoe3d.evaluation.calibration import calibration_error_of
 from geomoe3d.evaluation.metrics import is_right, motion_errors
 from geomoe3d.geometry.se3 import inverse
@@ -45,15 +47,19 @@ from geomoe3d.types import FloatArray
 BANDS = ((0.10, 0.30, 1044), (0.30, 0.60, 420), (0.60, 1.01, 423))
 """Overlap from, to, and share: 3DLoMatch's pairs, and 3DMatch's halved at 60 %."""
 UNRELATED_WEIGHT = 0.25
+ONCE = "second_look.repeat_below=0"
 LOOKS = (
-    ["second_look.descriptor=none", "second_look.grids=[]", "second_look.max_correspondences=0"],
-    ["second_look.below=1.0", "decision.min_confidence=1.0"],
+    ["second_look.descriptor=none", "second_look.grids=[]", "second_look.max_correspondences=0", ONCE],
+    ["second_look.below=1.0", "decision.min_confidence=1.0", ONCE],
 )
 """Settings by which a pair gets one look, and always two."""
-AS_USERS_DO: tuple[list[str], ...] = ([],)
+AS_USERS_DO: tuple[list[str], ...] = ([ONCE],)
 """The same for --second-look: a second look where the first one is in doubt."""
+REPEATED: tuple[list[str], ...] = (["second_look.repeat_below=0.985"],)
+"""The same for --repeat: twice from the start where the answer is not sure."""
 LOW_BANDS = ((0.10, 0.30, 3), (0.30, 1.01, 1))
 """Overlap from, to, and share of the pairs for --second-look."""
+REPEAT_NAMES = ("confidence_first", "confidence_second", "answers_agree")
 Drawn = tuple[str, str, str, list[Any] | None, bool]
 
 
@@ -139,6 +145,7 @@ def measure(
                     "status": result.status,
                     "lead": lead_of(result),
                     "margin": result.evidence.get("margin"),
+                    "repeat": [result.evidence.get(name) for name in REPEAT_NAMES],
                     "heard": "verdict" in result.evidence,
                     "support": result.num_inliers / max(result.num_correspondences, 1),
                     "observability": result.evidence.get("observability", 0.0),
@@ -167,10 +174,12 @@ def held(record: dict[str, Any]) -> Information:
     return Information(unknown, unknown[0, :3], record["observability"], 0, record["looseness"])
 
 
-def inputs_of(record: dict[str, Any], *, second_look: bool) -> FloatArray:
-    """(7,) or (2,) what the fit is a function of."""
+def inputs_of(record: dict[str, Any], fit: str) -> FloatArray:
+    """(7,), (2,) or (1,) what the fit is a function of."""
+    if fit == "repeat":
+        return np.array([np.mean([logit(confidence) for confidence in record["repeat"][:2]])])
     evidence, lead, support = Evidence(**record["evidence"]), record["lead"], record["support"]
-    if not second_look:
+    if fit == "evidence":
         return confidence_inputs(evidence, lead, support, held(record))
     said = confidence_score(evidence, lead, support, held(record), heard=record["heard"])
     return margin_inputs(float(np.log(said) - np.log1p(-said)), record["margin"])
@@ -184,9 +193,12 @@ def main() -> None:
     parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", default="runs/confidence.jsonl")
     parser.add_argument("--second-look", action="store_true", help="the fit of answers of a second look")
+    parser.add_argument("--repeat", action="store_true", help="the fit of answers that came out twice")
     parser.add_argument("--measured", action="store_true", help="fit on what OUT holds; register nothing")
     given = parser.parse_args()
-    looks, bands = (AS_USERS_DO, LOW_BANDS) if given.second_look else (LOOKS, BANDS)
+    fit = "second_look" if given.second_look else "repeat" if given.repeat else "evidence"
+    looks = {"evidence": LOOKS, "second_look": AS_USERS_DO, "repeat": REPEATED}[fit]
+    bands = BANDS if fit == "evidence" else LOW_BANDS
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import log_loss, roc_auc_score
     from sklearn.model_selection import GroupKFold, cross_val_predict
@@ -202,7 +214,9 @@ def main() -> None:
     records = [r for r in records if r["evidence"] is not None]
     if given.second_look:
         records = [r for r in records if r["margin"] is not None]
-    X = np.array([inputs_of(r, second_look=given.second_look) for r in records])
+    if fit == "repeat":
+        records = [r for r in records if r["repeat"][2]]
+    X = np.array([inputs_of(r, fit) for r in records])
     y = np.array([r["right"] for r in records])
     related = np.array([r["related"] for r in records])
     weight = np.where(related, 1.0, UNRELATED_WEIGHT)
@@ -234,7 +248,7 @@ def main() -> None:
     scaler, logistic = model[0], model[1]
     slopes = logistic.coef_[0] / scaler.scale_
     offset = float(logistic.intercept_[0] - slopes @ scaler.mean_)
-    names = ("evidence", "margin") if given.second_look else CONFIDENCE_INPUTS
+    names = {"evidence": CONFIDENCE_INPUTS, "second_look": ("evidence", "margin"), "repeat": ("mean",)}[fit]
     print(f"{', '.join(names)}: {np.round(slopes, 3).tolist()}")
     print(f"offset: {offset:.3f}")
 

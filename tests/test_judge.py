@@ -357,6 +357,8 @@ def test_the_formula_of_the_margin_in_the_docs_has_its_coefficients() -> None:
         [fit.offset, fit.evidence, fit.margin], abs=0.00501
     )
     assert f"between {fit.least_margin} and {fit.most_margin:g}" in " ".join(text.split())
+    twice = expert().repeat
+    assert f"both agree: sigmoid({twice.offset} + {twice.slope} mean)" in text
 
 
 @pytest.mark.parametrize(

@@ -269,7 +269,7 @@ def test_an_answer_that_is_ok_by_little_is_checked(monkeypatch):
     source, target, T = make_sample_pair(seed=0)
 
     def answer(*settings):
-        registrar = Registrar(load_config(None, ["voxel_size=0.08", *settings]))
+        registrar = Registrar(load_config(None, ["voxel_size=0.08", "second_look.repeat_below=0", *settings]))
         return registrar.register(source.file_points, target.file_points)
 
     doubting = "expert.confidence.plain_matches=1000000"

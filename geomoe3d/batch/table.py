@@ -31,7 +31,10 @@ MATRIX_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range
 _COLUMNS = ("source", "target", "id", "initial", *MATRIX_COLUMNS)
 
 PairLike = Sequence[Any]
-_OPEN_QUOTE = 'a cell begins with a quote that is not closed before the next separator; close it, or write "" for a quote'
+_OPEN_QUOTE = (
+    "a cell begins with a quote that is not closed before the next separator; close it, or write two quotes "
+    "for one that belongs to the cell"
+)
 _EXPECTED = "(source, target) or (source, target, first guess)"
 
 

@@ -49,7 +49,8 @@ def prepare(
         EmptyCloudError: fewer than 3 voxel points remain.
     """
     points, num_duplicates = drop_duplicates(cloud.points)
-    voxels = voxel_means(points, voxel_size)
+    shift = config.grid_shift * voxel_size
+    voxels = voxel_means(points + shift, voxel_size) - shift if shift else voxel_means(points, voxel_size)
     num_voxels = len(voxels)
     radius = config.normal_radius * voxel_size
     voxels = drop_isolated(voxels, radius)

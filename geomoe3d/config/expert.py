@@ -15,7 +15,7 @@ from functools import wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
 from geomoe3d.config.expert_clouds import LoadingExpert, PreparationExpert, ScatterExpert, ViewpointExpert
-from geomoe3d.config.expert_confidence import ConfidenceExpert
+from geomoe3d.config.expert_confidence import ConfidenceExpert, RepeatExpert
 from geomoe3d.config.expert_decision import (
     AccuracyExpert,
     CausesExpert,
@@ -55,6 +55,7 @@ class ExpertConfig(Section):
     correspondences: CorrespondencesExpert = CorrespondencesExpert()
     selection: SelectionExpert = SelectionExpert()
     confidence: ConfidenceExpert = ConfidenceExpert()
+    repeat: RepeatExpert = RepeatExpert()
     shared_surface: SharedSurfaceExpert = SharedSurfaceExpert()
     accuracy: AccuracyExpert = AccuracyExpert()
     parallel: ParallelExpert = ParallelExpert()

@@ -12,6 +12,7 @@ _FIT = "scripts/fit_confidence.py; docs/measurements.md holds what came of it on
 _SECOND_FIT = (
     "scripts/fit_confidence.py --second-look; docs/measurements.md holds what came of it on real scans"
 )
+_REPEAT_FIT = "scripts/fit_confidence.py --repeat; docs/measurements.md holds what came of it on real scans"
 _REAL_PAIRS = "right answers on real scans"
 Slope = Annotated[float, Field(ge=-1000, le=1000)]
 Slopes = tuple[Slope, Slope, Slope, Slope, Slope, Slope, Slope]
@@ -39,6 +40,19 @@ class MarginFit(Section):
     most_evidence: float = constant(8.0, "logit", (0, 50), "for and against, beyond which it says no more")
     least_margin: float = constant(-2.5, "-", (-50, 0), "below which less says no more")
     most_margin: float = constant(4.0, "-", (0, 50), "above which more says no more")
+
+
+class RepeatExpert(Section):
+    """A doubtful answer sought once more on a shifted grid (`decision/repeat.py`)."""
+
+    shift: float = constant(0.5, "voxels", (0, 1), "by which the grid is shifted along each axis")
+    seed_step: int = constant(1000, "-", (1, 1_000_000), "from the seed to that of its draws")
+    offset: float = constant(
+        0.57, "logit", (-50, 50), "where the mean of both answers' logits is 0", _REPEAT_FIT
+    )
+    slope: float = constant(
+        1.31, "logit per logit", (0, 10), "of that mean, where both answers agree", _REPEAT_FIT
+    )
 
 
 class ConfidenceExpert(Section):

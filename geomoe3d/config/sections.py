@@ -30,6 +30,12 @@ class PreparationConfig(Section):
     max_points: int = Field(
         30_000, ge=100, description="most voxel points per cloud; a finer voxel size is raised and said"
     )
+    grid_shift: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="by how much the grid lies off its usual place along each axis, in voxels",
+    )
     normal_radius: float = Field(2.0, gt=0, description="neighbourhood of a normal, in voxels")
     normal_neighbors: int = Field(30, ge=3, description="at most so many points fit a normal")
     viewpoint: Literal["auto", "origin", "guess", "centroid"] = Field(
@@ -182,6 +188,19 @@ class SecondLookConfig(Section):
         True,
         description="where no sensor position is known, ask again with the source's normals turned over "
         "whenever the answer is not ok",
+    )
+    repeat_below: float = Field(
+        0.97,
+        ge=0,
+        le=1,
+        description="an answer of less confidence is sought once more, from the start, on a shifted grid, and both "
+        "answers decide; up to checked_below one that has a rival or few matches too; 0: none is",
+    )
+    repeat_min_confidence: float = Field(
+        0.975,
+        ge=0,
+        le=1,
+        description="what both decide is ok from this confidence on; decision.min_confidence counts where it is higher",
     )
     mirror: bool = Field(
         True,

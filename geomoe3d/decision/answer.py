@@ -33,6 +33,15 @@ _DECIDING_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "open3d", "small_gicp", "
 
 
 @dataclass(frozen=True)
+class Repeat:
+    """What two answers of one pair said, each by itself, and whether they agree; see `joined`."""
+
+    first: float
+    second: float
+    agree: bool
+
+
+@dataclass(frozen=True)
 class Decision:
     """What was decided about a pair, in local frames.
 
@@ -42,6 +51,7 @@ class Decision:
         lead: score of the answer over that of the alternative, see `lead_over`.
         information, judgement: see their classes.
         margin: by how much the scorers of a second look prefer the answer, see `judge`; None: nobody was asked.
+        repeat: what both answers said where the pair was registered on two grids.
         hypotheses: all that were considered, best first, before refinement.
         scale: how large the source is beside the target under the answer, where that was measured.
         accuracy: how closely the clouds lie on each other, where that was measured.
@@ -56,6 +66,7 @@ class Decision:
     scale: Scale | None = None
     accuracy: Accuracy | None = None
     margin: float | None = None
+    repeat: Repeat | None = None
 
     @classmethod
     def failed(cls, reason: str) -> Decision:
@@ -224,9 +235,20 @@ def _evidence(decision: Decision, pair: Pair) -> dict[str, float]:
         "surface_score": evidence.surface_score,
         "score": decision.answer.score,
         **({} if decision.margin is None else {"margin": decision.margin}),
+        **_repeat(decision.repeat),
         "observability": decision.information.observability,
         "looseness": decision.information.looseness,
         **({} if scale is None else {"scale_ratio": scale.ratio, "scale_sigma": scale.sigma}),
+    }
+
+
+def _repeat(repeat: Repeat | None) -> dict[str, float]:
+    if repeat is None:
+        return {}
+    return {
+        "confidence_first": repeat.first,
+        "confidence_second": repeat.second,
+        "answers_agree": float(repeat.agree),
     }
 
 

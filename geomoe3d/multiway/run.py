@@ -37,7 +37,7 @@ from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.runtime.words import counted
 
-_ONCE = {"descriptor": "none", "grids": (), "max_correspondences": 0}  # no second look
+_ONCE = {"descriptor": "none", "grids": (), "max_correspondences": 0, "repeat_below": 0.0}  # no second look
 
 
 @shows_progress("pairs")

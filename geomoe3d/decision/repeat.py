@@ -1,0 +1,61 @@
+"""A doubtful answer is sought once more, from the start, on a shifted grid: two answers are made one.
+
+Which points stand for a cloud, their features and a good part of the matches are then others. A right answer comes out
+again; a wrong one often does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from geomoe3d.config import expert
+from geomoe3d.decision.answer import Decision, Repeat
+from geomoe3d.decision.confidence import Judgement, lead_over
+
+
+def joined(first: Decision, second: Decision, agree: bool, least: float) -> tuple[Decision, bool]:
+    """What is decided of a pair that has two answers: the surer one, and whether that is the second.
+
+    Where they agree, the logit of the confidence is a linear function of the mean of theirs. Else both cannot be right:
+    with odds a and b it is a / (1 + a + b), and the other answer is the alternative.
+
+    Args:
+        first, second: found on different grids, with an answer each.
+        agree: whether their transforms are not clearly different.
+        least: confidence from which an answer is ok.
+    """
+    said = Repeat(first.judgement.confidence, second.judgement.confidence, agree)
+    taken = second.judgement.confidence > first.judgement.confidence
+    best, other = (second, first) if taken else (first, second)
+    was = best.judgement
+    ours, theirs = (logit(decision.judgement.confidence) for decision in (best, other))
+    if agree:
+        fit = expert().repeat
+        confidence = 1 / (1 + np.exp(-(fit.offset + fit.slope * (ours + theirs) / 2)))
+    else:
+        confidence = np.exp(ours) / (1 + np.exp(ours) + np.exp(theirs))
+        if best.answer is not None and other.answer is not None:
+            lead = lead_over(best.answer.score, other.answer.score)
+            best = replace(best, alternative=other.answer, lead=lead)
+    return replace(best, judgement=_judged(was, float(confidence), agree, least), repeat=said), taken
+
+
+def _judged(was: Judgement, confidence: float, agree: bool, least: float) -> Judgement:
+    """A judgement with the confidence of both answers; a cause that it names stays."""
+    named = was.status != "ok" and was.unspecific is None
+    if named:
+        return replace(was, confidence=min(confidence, was.confidence))
+    reasons = tuple(reason for reason in was.reasons if reason != was.unspecific)
+    if confidence >= least:
+        return Judgement("ok", reasons, confidence)
+    found = "agree" if agree else "are clearly different (see the alternative)"
+    low = f"registered on two grids, the answers {found}; confidence {confidence:.2f} is below {least:.2f}"
+    return Judgement("low_confidence", (*reasons, low), confidence, low)
+
+
+def logit(confidence: float) -> float:
+    """Logarithm of the odds, of a confidence that is neither 0 nor 1 to the last digits."""
+    bounded = float(np.clip(confidence, 1e-6, 1 - 1e-6))
+    return float(np.log(bounded / (1 - bounded)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,6 +72,13 @@ def test_a_cause_that_was_named_stays(status: str) -> None:
     assert not taken and found.judgement.status == status
     assert found.judgement.reasons == ("another transform fits as well",)
     assert found.judgement.confidence <= 0.79
+    sure = decision(0.99, status="ok")
+    doubted, taken = joined(named, sure, True, 0.5)  # the same transform, of which one look knew a rival
+    assert taken and doubted.judgement.status == status and doubted.judgement.confidence <= 0.79
+    sliding = decision(0.2, status=status, cause="the shared surface lets the source slide")
+    assert joined(sliding, sure, True, 0.5)[0].judgement.confidence == 0.2
+    other, _ = joined(named, replace(sure, answer=decision(0.99, 5.0).answer), False, 0.5)
+    assert other.judgement.status == "ok"  # another one, of which no look knew a rival as good
 
 
 def test_points_of_a_shifted_grid_are_the_means_of_other_voxels() -> None:

@@ -19,7 +19,8 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
     """What is decided of a pair that has two answers: the surer one, and whether that is the second.
 
     Where they agree, the logit of the confidence is a linear function of the mean of theirs. Else both cannot be right:
-    with odds a and b it is a / (1 + a + b), and the other answer is the alternative.
+    with odds a and b it is a / (1 + a + b), and the other answer is the alternative. A cause that either names, of the
+    same transform, stays.
 
     Args:
         first, second: found on different grids, with an answer each.
@@ -29,24 +30,34 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
     said = Repeat(first.judgement.confidence, second.judgement.confidence, agree)
     taken = second.judgement.confidence > first.judgement.confidence
     best, other = (second, first) if taken else (first, second)
-    was = best.judgement
     ours, theirs = (logit(decision.judgement.confidence) for decision in (best, other))
+    doubt = _named(best.judgement)
     if agree:
         fit = expert().repeat
         confidence = 1 / (1 + np.exp(-(fit.offset + fit.slope * (ours + theirs) / 2)))
+        doubt = doubt or _named(other.judgement)  # of the same transform
     else:
         confidence = np.exp(ours) / (1 + np.exp(ours) + np.exp(theirs))
         if best.answer is not None and other.answer is not None:
             lead = lead_over(best.answer.score, other.answer.score)
             best = replace(best, alternative=other.answer, lead=lead)
-    return replace(best, judgement=_judged(was, float(confidence), agree, least), repeat=said), taken
+    if doubt is not None:
+        limits = expert().confidence
+        slides = doubt.confidence <= limits.most_sliding
+        most = doubt.confidence if slides else limits.most_doubted
+        judgement = replace(doubt, confidence=min(float(confidence), most))
+    else:
+        judgement = _judged(best.judgement, float(confidence), agree, least)
+    return replace(best, judgement=judgement, repeat=said), taken
+
+
+def _named(judgement: Judgement) -> Judgement | None:
+    """A judgement that names a cause for its doubt, else None."""
+    return None if judgement.status == "ok" or judgement.unspecific is not None else judgement
 
 
 def _judged(was: Judgement, confidence: float, agree: bool, least: float) -> Judgement:
-    """A judgement with the confidence of both answers; a cause that it names stays."""
-    named = was.status != "ok" and was.unspecific is None
-    if named:
-        return replace(was, confidence=min(confidence, was.confidence))
+    """A judgement that names no cause for doubt, with the confidence of both answers."""
     reasons = tuple(reason for reason in was.reasons if reason != was.unspecific)
     if confidence >= least:
         return Judgement("ok", reasons, confidence)

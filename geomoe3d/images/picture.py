@@ -13,7 +13,6 @@ from geomoe3d.types import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHOWN = 400
 KEPT, REJECTED, FAINT = "#2e9e5b", "#d1495b", "#999999"
 
 
@@ -52,7 +51,7 @@ def draw_matches(
     lines = pixels.reshape(-1, 2, 2)
     rng = np.random.default_rng(0)
     for rows, color, thickness in ((~kept, REJECTED, 0.3), (kept, KEPT, 0.6)):
-        some = lines[rng.permutation(np.flatnonzero(rows))[:SHOWN]] + [[0, 0], [width, 0]]
+        some = lines[rng.permutation(np.flatnonzero(rows))[:400]] + [[0, 0], [width, 0]]
         axes.add_collection(LineCollection(list(some), colors=color, linewidths=thickness, alpha=0.7))
     for column, (title, values) in enumerate(colours.items()):
         axes = figure.add_subplot(grid[1, column])

@@ -71,6 +71,15 @@ def test_eight_point_on_clean_matches_is_exact_and_weights_decide():
     assert spoilt.status != "ok"
 
 
+def test_eight_points_through_wrong_matches_are_not_sure_though_chance_finds_some():
+    """It rejects none: a pose that few of the matches agree with is a compromise that halves of them share."""
+    pixels, *_ = matches_of(1200, wrong=400, noise=0.05)
+    for wrong, told in ((0, False), (400, True)):
+        found = find_pose(pixels[: 1200 + wrong], (CAMERA, CAMERA), estimator="eight_point")
+        assert any("rejects none" in reason for reason in found.reasons) is told
+        assert (found.status == "ok") is not told
+
+
 def test_a_camera_that_only_turned_or_hardly_moved_is_ambiguous_and_its_rotation_right():
     for step in ((0.0, 0, 0), (1e-3, 0, 0)):
         pixels, _, T = matches_of(step=step, turn=10)
@@ -242,6 +251,8 @@ def test_a_pose_with_guessed_intrinsics_is_not_ok_and_a_network_weighs(pair, tmp
     assert done.return_value == 3
     verdict = ImageNetwork(weights)(np.random.default_rng(0).normal(size=(40, 4)))
     assert verdict.logits.shape == verdict.expert.shape == (40,)
+    assert len(set(verdict.sub_field)) > 1  # though one of them may take most of every match
+    assert "inlier_pixels" in answer
     save_pretrained(tmp_path / "c.safetensors", build_network(NetworkConfig(num_layers=1)), WeightCard({}))
     with pytest.raises(CheckpointError, match="clouds"):
         ImageNetwork(tmp_path / "c.safetensors")

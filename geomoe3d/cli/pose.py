@@ -194,7 +194,9 @@ def _tell(
             name: np.asarray(value).tolist() if value is not None else None for name, value in answer.items()
         }
         whole = {"status": status, "reasons": reasons, **plain, "matches": len(matches),
-                 "inliers": np.flatnonzero(inliers).tolist()}  # fmt: skip
+                 "inliers": np.flatnonzero(inliers).tolist(),
+                 "inlier_pixels": matches.pixels[inliers].tolist(),
+                 "inlier_residuals": residuals[inliers].tolist()}  # fmt: skip
         write_text(Path(given["output"]), json.dumps(whole, indent=2) + "\n", force=given["force"])
     if given["picture"] is not None:
         images = (read_grey(given["image0"]), read_grey(given["image1"]))

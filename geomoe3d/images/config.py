@@ -26,6 +26,7 @@ class PoseRules(Section):
     sureness: float = Field(0.99999, gt=0, lt=1, description="it stops when this sure of a clean sample")
     least_inliers: int = Field(30, ge=5, description="with fewer a wrong pose finds as many")
     over_chance: float = Field(3.0, ge=1, description="inliers beyond these, over those of chance")
+    least_agreeing: float = Field(0.25, ge=0, le=1, description="of kept matches, where none is rejected")
     least_parallax: float = Field(3.0, gt=0, description="inlier thresholds; with less it only turned")
     most_between_halves_deg: float = Field(10.0, gt=0, description="between poses of halves of the matches")
     other_pose_deg: float = Field(3.0, gt=0, description="a pose so far off is another one")

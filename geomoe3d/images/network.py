@@ -19,7 +19,7 @@ class Verdict(NamedTuple):
     """What a network says of N matches; GeoMoE alone has sub-fields and experts."""
 
     logits: FloatArray  # (N,), above 0 for inliers
-    sub_field: IntArray | None  # (N,) from which each match is mostly rebuilt
+    sub_field: IntArray | None  # (N,) from which each match is rebuilt by most more than the mean match
     expert: IntArray | None  # (N,) with the largest weight for that sub-field
 
     @property
@@ -49,6 +49,7 @@ class ImageNetwork:
         logits, sub_field, expert = out.logits[-1, 0].double().numpy(), None, None
         if out.insights:
             last = out.insights[-1]
-            sub_field = last.sub_field[0].numpy()
+            # Some sub-fields take part in all matches; what tells these apart is by how much more than elsewhere.
+            sub_field = (last.shares[0] / last.shares[0].mean(0)).argmax(1).numpy()
             expert = None if last.expert is None else last.expert[0].numpy()[sub_field]
         return Verdict(logits, sub_field, expert)

@@ -8,7 +8,7 @@ all inliers lie in one plane, agreement that chance would give as well, and whet
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -109,7 +109,11 @@ def find_pose(
         return PoseResult("failed", (reason,), None, None, none, np.full(len(pixels), np.inf))
     residuals = np.nan_to_num(residuals_of(T, rays) * focal, nan=np.inf)
     inliers = (w > 0) & _agrees(T, rays, threshold / focal)
-    return _judged(T, rays, inliers, residuals, kept, threshold / focal, focal, pose_of)
+    result = _judged(T, rays, inliers, residuals, kept, threshold / focal, focal, pose_of)
+    if estimator == "eight_point" and inliers.sum() < POSE.least_agreeing * len(kept):
+        few = f"{inliers.sum()} of {len(kept)} kept matches agree, and eight_point rejects none; try magsac or ransac"
+        return replace(result, status="low_confidence", reasons=(*result.reasons, few))
+    return result
 
 
 def residuals_of(T: FloatArray, rays: FloatArray) -> FloatArray:

@@ -33,12 +33,14 @@ class LayerInsight:
 
     Attributes:
         sub_field: (B, N) int64, the sub-field from which each correspondence is mostly rebuilt.
+        shares: (B, N, M) how much of each correspondence is rebuilt from each sub-field, mean over heads.
         expert: (B, M) int64, the expert with the largest weight in the second F-MoE, or None without one.
         usage: (2, T) mean weight of each expert in the two F-MoEs, or None.
         entropy: (2,) router entropy over log T, or None.
     """
 
     sub_field: Tensor
+    shares: Tensor
     expert: Tensor | None
     usage: Tensor | None
     entropy: Tensor | None
@@ -164,11 +166,12 @@ def find_neighbors(coordinates: Tensor, config: NetworkConfig, mask: Tensor | No
 
 
 def _insight(attention: Tensor, routing: tuple[Routing | None, Routing | None]) -> LayerInsight:
-    sub_field = attention.detach().mean(dim=1).argmax(dim=-1)
+    shares = attention.detach().mean(dim=1)
+    sub_field = shares.argmax(dim=-1)
     if routing[0] is None or routing[1] is None:
-        return LayerInsight(sub_field, None, None, None)
+        return LayerInsight(sub_field, shares, None, None, None)
     usage, entropy = (torch.stack([getattr(r, name) for r in routing]) for name in ("usage", "entropy"))
-    return LayerInsight(sub_field, routing[1].weights.detach().argmax(dim=1), usage, entropy)
+    return LayerInsight(sub_field, shares, routing[1].weights.detach().argmax(dim=1), usage, entropy)
 
 
 def _collect(

@@ -159,6 +159,16 @@ def test_the_margin_stands_on_the_console_and_on_the_page(margin: float, words: 
     assert words in render_page(replace(view, result=result))
 
 
+@pytest.mark.parametrize(("agree", "words"), [(1.0, "the same transform"), (0.0, "two different transforms")])
+def test_what_a_second_grid_gave_stands_on_the_console_and_on_the_page(agree: float, words: str) -> None:
+    view = room_view()
+    said = {"confidence_first": 0.951, "confidence_second": 0.402, "answers_agree": agree}
+    result = replace(view.result, evidence={**view.result.evidence, **said})
+    told = f"registered on two grids, which gave {words} (confidence 0.95 and 0.40)"
+    assert told in summary(result)
+    assert told in render_page(replace(view, result=result))
+
+
 def test_the_paragraph_and_the_figures_name_one_overlap() -> None:
     result = replace(room_view().result, accuracy=replace(FOUND, overlap_source=0.667), overlap=0.6787)
     assert dict(accuracy_facts(result))["overlap"].startswith("67% of the source")

@@ -48,12 +48,19 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
 
 
 def margin_facts(result: RegistrationResult) -> list[tuple[str, str]]:
-    """Name and text of the margin; nothing where a second look gave none."""
-    margin = result.evidence.get("margin")
-    if margin is None:
-        return []
-    this, other = ("this transform", "the best different one")[:: 1 if margin >= 0 else -1]
-    return [("margin", f"the second look prefers {this} to {other} by a factor of {np.exp(abs(margin)):.3g}")]
+    """Names and texts of the margin and of the answer on another grid, as far as these were asked for."""
+    margin, agree = (result.evidence.get(name) for name in ("margin", "answers_agree"))
+    facts = []
+    if margin is not None:
+        this, other = ("this transform", "the best different one")[:: 1 if margin >= 0 else -1]
+        said = f"the second look prefers {this} to {other} by a factor of {np.exp(abs(margin)):.3g}"
+        facts.append(("margin", said))
+    if agree is not None:
+        first, second = (result.evidence[f"confidence_{name}"] for name in ("first", "second"))
+        same = "the same transform" if agree else "two different transforms"
+        said = f"registered on two grids, which gave {same} (confidence {first:.2f} and {second:.2f})"
+        facts.append(("second grid", said))
+    return facts
 
 
 def _rmse(value: float, unit: str) -> str:

@@ -170,7 +170,10 @@ class Line:
         if self.again is None or self.given is not None or not self.pipeline.scorers:
             return False  # that is not asked, or nothing would be other
         below, judgement = self.config.second_look.repeat_below, look.decision.judgement
-        unsure = judgement.confidence < below or (below > 0 and self._may_be_wrong(look.pair, look.decision))
+        few = expert().repeat.few_matches
+        unsure = judgement.confidence < below or (
+            below > 0 and self._may_be_wrong(look.pair, look.decision, few)
+        )
         return unsure and judgement.status != "failed"
 
     def _sought_again(
@@ -186,7 +189,7 @@ class Line:
         shift = expert().selection.different_shift * look.pair.inlier_threshold
         found = look.decision.T_target_source, other.decision.T_target_source
         agree = not are_different(*found, look.pair.clouds[0], shift)
-        least = max(self.config.decision.min_confidence, self.config.second_look.repeat_min_confidence)
+        least = max(self.config.decision.min_confidence, self.config.second_look.min_confidence)
         decision, taken = joined(look.decision, other.decision, agree, least)
         return (other if taken else look)._replace(decision=decision)
 
@@ -291,14 +294,15 @@ class Line:
         if self.pipeline.second_descriptor is None or not self.pipeline.scorers or self.once:
             return False
         asked = have_margin(self.pipeline.second_scorers)
-        return decision.judgement.status != "ok" or (asked and self._may_be_wrong(pair, decision))
+        few = expert().confidence.plain_matches
+        return decision.judgement.status != "ok" or (asked and self._may_be_wrong(pair, decision, few))
 
-    def _may_be_wrong(self, pair: Pair, decision: Decision) -> bool:
-        """Whether an answer that is ok is so by little, and has a rival or few matches that agree."""
+    def _may_be_wrong(self, pair: Pair, decision: Decision, few: int) -> bool:
+        """Whether an answer that is ok is so by little, and has a rival or ``few`` matches that agree."""
         if decision.judgement.confidence >= self.config.second_look.checked_below:
             return False
-        limits, agreeing = expert().confidence, decision.residuals(pair.matched) < pair.inlier_threshold
-        return decision.lead < limits.most_lead or int(agreeing.sum()) < limits.plain_matches
+        agreeing = decision.residuals(pair.matched) < pair.inlier_threshold
+        return decision.lead < expert().confidence.most_lead or int(agreeing.sum()) < few
 
     def _is_doubtful(self, judgement: Judgement) -> bool:
         """Whether a second look is to be taken, at more matches and on coarser grids."""

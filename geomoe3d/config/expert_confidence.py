@@ -46,6 +46,9 @@ class RepeatExpert(Section):
     """A doubtful answer sought once more on a shifted grid (`decision/repeat.py`)."""
 
     shift: float = constant(0.5, "voxels", (0, 1), "by which the grid is shifted along each axis")
+    few_matches: int = constant(
+        30, "matches", (0, 100_000), "fewer that agree with an answer that is ok by little", _REAL_PAIRS
+    )
     seed_step: int = constant(1000, "-", (1, 1_000_000), "from the seed to that of its draws")
     offset: float = constant(
         0.57, "logit", (-50, 50), "where the mean of both answers' logits is 0", _REPEAT_FIT

@@ -139,8 +139,8 @@ class SecondLookConfig(Section):
         0.96,
         ge=0,
         le=1,
-        description="an answer found with that descriptor, or checked by these scorers, is ok from this confidence on; "
-        "decision.min_confidence counts where it is higher",
+        description="an answer found with that descriptor, checked by these scorers or sought twice is ok from this "
+        "confidence on; decision.min_confidence counts where it is higher",
     )
     checked_below: float = Field(
         0.985,
@@ -194,13 +194,8 @@ class SecondLookConfig(Section):
         ge=0,
         le=1,
         description="an answer of less confidence is sought once more, from the start, on a shifted grid, and both "
-        "answers decide; up to checked_below one that has a rival or few matches too; 0: none is",
-    )
-    repeat_min_confidence: float = Field(
-        0.975,
-        ge=0,
-        le=1,
-        description="what both decide is ok from this confidence on; decision.min_confidence counts where it is higher",
+        "answers decide; up to checked_below one that has a rival or few matches too; ok from min_confidence on; 0: "
+        "none is",
     )
     mirror: bool = Field(
         True,

@@ -100,6 +100,15 @@ def test_two_pairs_and_most_of_those_that_are_sure_must_say_that_a_part_is_mirro
     assert all(text.startswith(f"mirrored: {min(len(told), 2)} of") for text in found.values())
 
 
+def test_one_pair_is_enough_where_a_scan_is_not_placed_and_none_is_sure():
+    pairs = [(k, 9) for k in range(6)]
+    told = dict(zip(pairs, [outcome(MIRRORED), *[outcome("too few")] * 5], strict=True))
+    asked = {(9,): pairs}
+    assert mirrored_scans(asked, told) == {}
+    assert mirrored_scans(asked, told, {(9,)})[9].startswith("mirrored: 1 of 6 pairs fits clearly better")
+    assert mirrored_scans(asked, {**told, (5, 9): outcome(status="ok")}, {(9,)}) == {}
+
+
 def test_pairs_are_shared_out_so_that_every_part_asked_gets_as_many_as_a_verdict_needs():
     asked = {(5,): [(0, 5), (1, 5), (2, 5)], (6,): [(3, 6)], (7,): [(0, 7), (1, 7), (2, 7)]}
     needed = {(0, 5), (1, 5), (3, 6), (0, 7), (1, 7)}

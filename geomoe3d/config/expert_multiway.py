@@ -41,12 +41,24 @@ class ManyPairsExpert(Section):
     )
     maps_per_groups: int = constant(6, "pairs", (0, 1000), "of maps of two groups")
     most_maps: int = constant(32, "pairs", (0, 10_000), "of maps in one round")
+    whole_scans: int = constant(
+        60,
+        "scans",
+        (0, 10_000),
+        "of a group whose merged model is registered with those of other groups at most",
+    )
     map_rounds: int = constant(2, "rounds", (0, 100), "of local maps")
     checked: int = constant(
         3,
         "pairs",
         (1, 100),
         "of scans that nothing sure ties to the rest, asked about mirrored axes and units",
+    )
+    checked_unplaced: int = constant(
+        8,
+        "pairs",
+        (1, 100),
+        "so asked of a scan that is not placed: those that it truly overlaps are hard to tell when it is mirrored",
     )
     most_checked: int = constant(60, "pairs", (0, 10_000), "so asked in all")
     initial_shift: float = constant(

@@ -3,14 +3,14 @@
 Place: after grouping. Walls and floors of a mirrored scan lie on those of the others, and then many doubtful pairs
 agree on a place for it; but none of them is sure. So parts of the model that nothing sure ties to the rest are looked
 at again, by a few of their pairs, and asked what one pair alone is asked: whether they fit clearly better mirrored, or
-in another unit. Cost: three pairs for each such part, up to a limit in all, none in a model that sure pairs hold
-together.
+in another unit. Cost: three pairs for each such part, more where it is not placed, up to a limit in all; none in a
+model that sure pairs hold together.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 
 from geomoe3d.batch.folder import remove_batch
 from geomoe3d.batch.store import Outcome
@@ -37,8 +37,14 @@ def find_faults(survey: Survey, groups: Sequence[Group], edges: Sequence[Edge]) 
         edges: of all registered pairs, with what triangles say of them.
     """
     parts = loose_parts(range(len(survey.scans)), groups)
-    asked = {part: _asked(survey, part, edges) for part in parts[1:]}
-    most = expert().many_pairs.most_checked
+    known = expert().many_pairs
+    placed = {scan for group in groups if len(group.poses) > 1 for scan in group.poses}
+    unplaced = {part for part in parts[1:] if placed.isdisjoint(part)}
+    asked = {
+        part: _asked(survey, part, edges, known.checked_unplaced if part in unplaced else known.checked)
+        for part in parts[1:]
+    }
+    most = known.most_checked
     wanted, left = shared_out(asked, most)
     if left:
         names = ", ".join(survey.scans[part[0]].name for part in left[:5])
@@ -48,7 +54,7 @@ def find_faults(survey: Survey, groups: Sequence[Group], edges: Sequence[Edge]) 
             "are looked at again (expert.many_pairs.most_checked)"
         )
     checks = survey.register_apart(sorted(wanted), of_checks(survey.config), CHECKS_FOLDER)
-    found = mirrored_scans(asked, checks)
+    found = mirrored_scans(asked, checks, unplaced)
     kept = {id(edge.T_target_source) for group in groups for edge in group.edges}
     holding = [e for e in edges if id(e.T_target_source) in kept]
     return {**found, **scans_of_other_units({**survey.outcomes, **checks}, holding)}
@@ -102,9 +108,8 @@ def loose_parts(scans: Iterable[int], groups: Sequence[Group]) -> list[tuple[int
     return [tuple(part) for part in connected_parts(scans, sure)]
 
 
-def _asked(survey: Survey, part: tuple[int, ...], edges: Sequence[Edge]) -> list[PairKey]:
+def _asked(survey: Survey, part: tuple[int, ...], edges: Sequence[Edge], count: int) -> list[PairKey]:
     """The pairs of a part with others that are looked at again: the surest, then those that look alike."""
-    count = expert().many_pairs.checked
     across = [e for e in edges if (e.source in part) != (e.target in part) and not e.of_maps]
     likely = [key_of(e.source, e.target) for e in sorted(across, key=lambda e: -e.worth)]
     others = [k for k in survey.usable() if k not in part]
@@ -114,24 +119,29 @@ def _asked(survey: Survey, part: tuple[int, ...], edges: Sequence[Edge]) -> list
 
 
 def mirrored_scans(
-    asked: Mapping[tuple[int, ...], Sequence[PairKey]], checks: Mapping[PairKey, Outcome]
+    asked: Mapping[tuple[int, ...], Sequence[PairKey]],
+    checks: Mapping[PairKey, Outcome],
+    unplaced: Container[tuple[int, ...]] = (),
 ) -> dict[int, str]:
-    """Scans of the parts of which two pairs at least, and most, fit clearly better mirrored; one, where a part has
-    no other.
+    """Scans of the parts of which two pairs at least, and more than are sure, fit clearly better mirrored; one, where a
+    part has no other or is not placed.
 
     Args:
         asked: pairs by part.
         checks: what became of them.
+        unplaced: parts of scans that are in no group.
     """
     found: dict[int, str] = {}
     for part, pairs in asked.items():
         told = [checks[pair] for pair in pairs if pair in checks]
         said = [sentence for outcome in told if (sentence := _said(outcome, MIRRORED))]
         against = sum(outcome.status == "ok" for outcome in told)
-        if len(said) > max(against, 1 if len(pairs) > 1 else 0):
+        alone = len(pairs) == 1 or (part in unplaced and len(told) > 1)
+        if len(said) > max(against, 0 if alone else 1):
             text = (
-                f"{MIRRORED}: {len(said)} of {len(told)} pairs fit clearly better with one of the two scans mirrored; "
-                "if the axes of this one are left-handed (often two are exchanged), bring them to right-handed ones"
+                f"{MIRRORED}: {len(said)} of {counted(len(told), 'pair')} {'fit' if len(said) > 1 else 'fits'} clearly "
+                "better with one of the two scans mirrored; if the axes of this one are left-handed (often two are "
+                "exchanged), bring them to right-handed ones"
             )
             found |= dict.fromkeys(part, text)
     return found

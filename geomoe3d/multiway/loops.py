@@ -47,10 +47,7 @@ def find_loops(poses: Poses, edges: Sequence[Edge], shapes: Sequence[Shape], vox
         shapes: of all scans.
         voxel_size: of the common grid, cloud units.
     """
-    known = expert().many_groups
-    inside = [e for e in edges if {e.source, e.target} <= poses.keys()]
-    # A pair that was sure by itself is followed though the others contradict it: they may be wrong alike.
-    sure = [e for e in inside if e.worth >= known.loop_worth or e.confidence >= known.loop_confidence]
+    sure = [e for e in edges if {e.source, e.target} <= poses.keys() and closes_loops(e)]
     tree = spanning_tree(sure)
     beside: dict[int, list[tuple[int, Edge]]] = {}
     for edge in sure:
@@ -70,6 +67,13 @@ def find_loops(poses: Poses, edges: Sequence[Edge], shapes: Sequence[Shape], vox
                     waiting.append(there)
     found = [_loop(edge, up, shapes, voxel_size) for edge in sure if id(edge) not in tree]
     return sorted(found, key=lambda loop: (loop.closes, -loop.shift, loop.scans))
+
+
+def closes_loops(edge: Edge) -> bool:
+    """Whether a pair is sure enough to be followed: in the company of the others, or by itself though the others
+    contradict it, since they may be wrong alike."""
+    known = expert().many_groups
+    return edge.worth >= known.loop_worth or edge.confidence >= known.loop_confidence
 
 
 def _loop(

@@ -99,6 +99,29 @@ def map_pairs(
     return found[: expert().many_pairs.most_maps]
 
 
+def whole_pairs(groups: Sequence[Group]) -> list[MapPair]:
+    """Pairs of whole groups, and of the largest with single scans, as maps about their middle scans.
+
+    Args:
+        groups: the largest first; those of more than 60 scans are left out, since local maps show as much of them.
+    """
+    known = expert().many_pairs
+    made = [group for group in groups if 1 < len(group.poses) <= known.whole_scans]
+    alone = [group for group in groups if len(group.poses) == 1]
+    pairs = [*combinations(made, 2), *((made[0], one) for one in alone if made)]
+    pairs = [(a, b) for a, b in pairs if len(a.poses) + len(b.poses) > known.map_scans]
+    members = {id(group): _middle_first(group.poses) for group in groups}
+    found = [(members[id(a)], members[id(b)]) for a, b in pairs[: known.most_maps]]
+    return [MapPair(b[0], a[0], (b, a)) for a, b in found]
+
+
+def _middle_first(poses: Poses) -> tuple[int, ...]:
+    """All scans of a group, the one that stands nearest to their mean first."""
+    middle = np.mean([T[:3, 3] for T in poses.values()], axis=0)
+    first = min(sorted(poses), key=lambda k: float(np.linalg.norm(poses[k][:3, 3] - middle)))
+    return first, *(k for k in sorted(poses) if k != first)
+
+
 def write_map(
     folder: Path, members: Sequence[int], poses: Poses, surfaces: Mapping[int, Surface], sensor: FloatArray
 ) -> Path:

@@ -13,7 +13,7 @@ from geomoe3d.decision.scale import DIFFERS
 from geomoe3d.geometry.se3 import shift_frames
 from geomoe3d.multiway.edges import Edge, agrees, differences, expected_error, predicted_motion
 from geomoe3d.multiway.holding import is_denied
-from geomoe3d.multiway.loops import find_loops
+from geomoe3d.multiway.loops import closes_loops, find_loops
 from geomoe3d.multiway.model import EdgeReport, LoopReport, SceneGroup, SceneModel, file_poses
 from geomoe3d.multiway.pose_graph import spanning_tree
 from geomoe3d.multiway.rules import Group
@@ -57,7 +57,9 @@ def describe_model(
             LoopReport(tuple(names[k] for k in loop.scans), loop.shift, loop.turn_deg, loop.closes)
             for loop in find_loops(group.poses, heard, survey.shapes, survey.voxel_size)
         )
-        contradictions = [reports[k][1] for k in elsewhere if k not in denied]
+        contradictions = [
+            reports[k][1] for k in elsewhere if k not in denied and _is_ok(survey, reports[k][0])
+        ]
         contradictions.sort(key=lambda report: -report.confidence)
         made.append(
             SceneGroup(reference, poses, dict(group.poses), tuple(group.edges), loops, tuple(contradictions))
@@ -78,10 +80,15 @@ def describe_model(
     )
 
 
-def _is_elsewhere(survey: Survey, edge: Edge, report: EdgeReport) -> bool:
-    """Whether a pair within a group was `ok` by itself and moves its source farther from the poses than bends do."""
+def _is_ok(survey: Survey, edge: Edge) -> bool:
+    """Whether registration alone was sure of a pair of scans."""
     outcome = None if edge.of_maps else survey.outcomes.get(key_of(edge.source, edge.target))
-    if report.shift is None or report.turn_deg is None or outcome is None or outcome.status != "ok":
+    return outcome is not None and outcome.status == "ok"
+
+
+def _is_elsewhere(survey: Survey, edge: Edge, report: EdgeReport) -> bool:
+    """Whether a sure pair within a group moves its source farther from the poses than bends do."""
+    if report.shift is None or report.turn_deg is None or not (_is_ok(survey, edge) or closes_loops(edge)):
         return False
     bent, rules = expert().many_groups.bent, survey.rules
     return report.shift > bent * rules.tolerance or report.turn_deg > bent * rules.turn_deg

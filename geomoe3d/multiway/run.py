@@ -177,6 +177,12 @@ def register_scans(
         known, groups = groups, assembly.groups()
         if [group.poses.keys() for group in groups] == [group.poses.keys() for group in known]:
             break
+    wholes = survey.whole_pairs(groups) if rounds else []
+    if wholes:
+        clock(f"whole groups: register {counted(len(wholes), 'pair')} of their merged models")
+        survey.register_maps(wholes, groups)
+        clock("group scans")
+        groups = assembly.groups()
     clock("check scans that no sure pair holds")
     faults = find_faults(survey, groups, assembly.edges)
     clock("write the model")

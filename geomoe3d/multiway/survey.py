@@ -27,7 +27,7 @@ from geomoe3d.multiway.alignment import Surface
 from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
 from geomoe3d.multiway.free_space import FreeSpace
 from geomoe3d.multiway.initial import InitialPoses
-from geomoe3d.multiway.maps import MAPS_FOLDER, MapPair, map_pairs, write_map
+from geomoe3d.multiway.maps import MAPS_FOLDER, MapPair, map_pairs, whole_pairs, write_map
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.multiway.pose_graph import Library
 from geomoe3d.multiway.proposals import most_similar, scan_similarity
@@ -244,8 +244,16 @@ class Survey:
             groups: as they stand, the largest first.
             edges: all so far, with what cycles say of them.
         """
-        usable = [group for group in groups if set(group.poses) <= self.surfaces.keys()]
-        return map_pairs(usable, edges, self.similarity, self.overlaps, sequence=self.sequence)
+        return map_pairs(
+            self._described(groups), edges, self.similarity, self.overlaps, sequence=self.sequence
+        )
+
+    def whole_pairs(self, groups: list[Group]) -> list[MapPair]:
+        """Pairs of the merged models of whole groups that are still apart, the largest first."""
+        return whole_pairs(self._described(groups))
+
+    def _described(self, groups: list[Group]) -> list[Group]:
+        return [group for group in groups if set(group.poses) <= self.surfaces.keys()]
 
     def _known(self) -> set[PairKey]:
         """Pairs in the journal whose scans are the same today, wherever they lie."""

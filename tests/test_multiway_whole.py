@@ -45,7 +45,9 @@ def test_the_merged_models_of_two_groups_join_what_no_pair_does(tmp_path):
         np.save(files[-1], part)
     config = load_config(None, SETTINGS)
     store = BatchStore(tmp_path / "pairs", config)
-    survey = Survey(find_scans(files), config, store, Labour(1, None, None).checked(), None, print)
+    told: list[tuple[int, int]] = []
+    labour = Labour(1, None, None).checked()
+    survey = Survey(find_scans(files), config, store, labour, lambda *now: told.append(now), print)
     survey.describe({})
     store.begin()
     local = {k: shift_frames(T, -survey.shapes[k].origin, np.zeros(3)) for k, T in truth.items()}
@@ -57,5 +59,6 @@ def test_the_merged_models_of_two_groups_join_what_no_pair_does(tmp_path):
     error = inverse(local[pair.target]) @ local[pair.source] - edge.T_target_source
     assert np.abs(error).max() < 0.05
     survey.register([(0, 1), (1, 2), (3, 4)])
+    assert told == [(0, 1), (1, 1), *((done, 4) for done in (1, 2, 3, 4))]  # never fewer than before
     (whole,) = Assembly(survey).groups()
     assert sorted(whole.poses) == [0, 1, 2, 3, 4]

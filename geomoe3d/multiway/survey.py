@@ -104,6 +104,7 @@ class Survey:
         self.outcomes: dict[PairKey, Outcome] = {}
         self.edges: dict[PairKey, Edge] = {}
         self.map_edges: dict[str, Edge] = {}
+        self._done = 0  # pairs, those of maps too
 
     # ---- the scans by themselves
 
@@ -303,6 +304,7 @@ class Survey:
             list(unique.values()), self.store, self.config, self.labour,
             progress=self._count() or False, say=self.say,
         )  # fmt: skip
+        self._done += len(unique)
         return {name: self.store.outcome(records[name]) for name in unique}
 
     def register_apart(
@@ -328,7 +330,7 @@ class Survey:
 
     def _count(self) -> Callable[[int, int], None] | None:
         """Progress of one round, told as that of all pairs so far proposed."""
-        tell, before = self.progress, len(self.outcomes)
+        tell, before = self.progress, self._done
         if tell is None:
             return None
         return lambda done, total: tell(before + done, before + total)

@@ -27,7 +27,7 @@ from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.information import distance_under
 from geomoe3d.decision.parallel import made_parallel
-from geomoe3d.decision.remarks import data_remarks, remarks
+from geomoe3d.decision.remarks import data_remarks, far_sensors, remarks
 from geomoe3d.decision.repeat import joined
 from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
 from geomoe3d.decision.selection import Selection, are_different, surfaces_of
@@ -142,7 +142,7 @@ class Line:
             data, look.pair.clouds, wanted, places is not None, config.preparation, decision.judgement
         )
         causes = () if decision.judgement.status == "ok" else data_remarks(clouds, wanted, config.preparation)
-        for remark in (*clouds[0].notes, *clouds[1].notes, *causes, *told_of):
+        for remark in (*clouds[0].notes, *clouds[1].notes, *far_sensors(clouds), *causes, *told_of):
             decision = decision.with_note(remark)
         return self._finished(look._replace(decision=decision), clouds)
 
@@ -185,7 +185,8 @@ class Line:
         prepared = line.pipeline.prepare_both(clouds, size, places or (None, None), self.clock, sides)
         other = line._best(clouds, prepared, places, sides)
         if other.decision.answer is None:
-            return look
+            nothing = "registered once more on a shifted grid, no transform was found"
+            return look._replace(decision=look.decision.doubted(nothing))
         shift = expert().selection.different_shift * look.pair.inlier_threshold
         found = look.decision.T_target_source, other.decision.T_target_source
         agree = not are_different(*found, look.pair.clouds[0], shift)

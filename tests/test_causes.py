@@ -17,7 +17,7 @@ from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.causes import mirrored_axes
 from geomoe3d.decision.confidence import Judgement
-from geomoe3d.decision.remarks import data_remarks
+from geomoe3d.decision.remarks import data_remarks, far_sensors
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.surfaces import SURFACES, Evidence
@@ -57,9 +57,9 @@ def test_a_sensor_said_to_stand_far_away_is_named() -> None:
         with_sensor(load_points(points, name="scan"), place, "auto")
         for place in ((0.0, 0, 0), (1003.0, 0, 0))
     )
-    said, *_ = data_remarks((far, near), 0.25, PreparationConfig())
+    (said,) = far_sensors((far, near))
     assert said.startswith("the sensor of 'scan' is said to have stood 999.9 from it")
-    assert not any("sensor" in s for s in data_remarks((near, near), 0.25, PreparationConfig()))
+    assert not list(far_sensors((near, near)))
 
 
 def test_a_voxel_size_far_from_the_usual_one_is_named() -> None:

@@ -361,8 +361,14 @@ def test_the_formula_of_the_margin_in_the_docs_has_its_coefficients() -> None:
     assert f"both agree: sigmoid({twice.offset} + {twice.slope} mean)" in text
 
 
+def test_numbers_that_say_nothing_are_not_believed() -> None:
+    found = Evidence(0.5, 0.5, 0.3, 0.0)
+    assert confidence_score(found, 3.0, 0.05, replace(FIRM, looseness=np.nan)) == 0.0
+    assert confidence_score(found, 3.0, 0.05, FIRM, margin=np.nan) == 0.0
+
+
 @pytest.mark.parametrize(
     ("value", "limit", "said"), [(0.918, 0.95, "0.92"), (0.9496, 0.95, "0.94"), (0.9599, 0.96, "0.95")]
 )
 def test_a_confidence_is_said_as_on_top_and_never_as_a_limit_that_it_misses(value, limit, said):
-    assert confidence._said_below(value, limit) == said
+    assert confidence.said_below(value, limit) == said

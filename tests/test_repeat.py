@@ -15,6 +15,7 @@ from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.information import Information
 from geomoe3d.decision.repeat import joined
 from geomoe3d.geometry.draws import OFF_ROUND
+from geomoe3d.line import Line
 from geomoe3d.pipeline import Pipeline, resolved
 from geomoe3d.registration import Registrar
 from geomoe3d.scoring.surfaces import SURFACES, Evidence
@@ -79,6 +80,41 @@ def test_a_cause_that_was_named_stays(status: str) -> None:
     assert joined(sliding, sure, True, 0.5)[0].judgement.confidence == 0.2
     other, _ = joined(named, replace(sure, answer=decision(0.99, 5.0).answer), False, 0.5)
     assert other.judgement.status == "ok"  # another one, of which no look knew a rival as good
+
+
+def test_a_rival_that_a_reason_speaks_of_stays_the_alternative_of_an_answer_that_differs() -> None:
+    rival = decision(0.5, 2.0).answer
+    named = replace(
+        decision(0.79, 0.0, "ambiguous", "another transform fits as well"), alternative=rival, lead=1.1
+    )
+    found, taken = joined(named, decision(0.3, 5.0), False, 0.95)
+    assert not taken and found.alternative is rival and found.lead == 1.1
+    assert found.judgement.reasons == (
+        "another transform fits as well",
+        "registered on two grids, the answers are clearly different",
+    )
+
+
+def test_a_limit_that_is_missed_by_little_is_not_said_to_be_below_itself() -> None:
+    found, _ = joined(decision(0.896), decision(0.896), True, 0.97)
+    assert 0.965 < found.judgement.confidence < 0.97
+    assert "confidence 0.96 is below 0.97" in found.judgement.reasons[0]
+
+
+def test_an_answer_that_does_not_come_out_again_is_not_ok(monkeypatch) -> None:
+    source, target, _ = make_sample_pair(seed=0)
+    registrar = Registrar(load_config(None, ["voxel_size=0.05", "second_look.repeat_below=1.0"]))
+    found = Line._best
+
+    def nothing_else(self, clouds, prepared, places, first):
+        look = found(self, clouds, prepared, places, first)
+        again = self.pipeline.config.preparation.grid_shift > 0
+        return look._replace(decision=Decision.failed("nothing")) if again else look
+
+    monkeypatch.setattr(Line, "_best", nothing_else)
+    answer = registrar.register(source, target)
+    assert answer.status == "low_confidence" and answer.has_transform
+    assert answer.reasons[0] == "registered once more on a shifted grid, no transform was found"
 
 
 def test_points_of_a_shifted_grid_are_the_means_of_other_voxels() -> None:

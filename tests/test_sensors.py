@@ -49,6 +49,10 @@ def test_none_is_no_sensor_even_where_one_could_stand_at_the_origin() -> None:
 
 @pytest.mark.parametrize("sensor", ["origin", (1.0, 2.0), (1.0, 2.0, np.nan)])
 def test_what_is_no_place_is_refused(sensor: object) -> None:
+    with pytest.raises(
+        InputError, match=r"sensor of the source is at \[1e\+300, 0.0, 0.0\], beyond the limit of 1e\+12"
+    ):
+        with_sensors(clouds(), ((1e300, 0, 0), None), "auto")
     with pytest.raises(InputError, match="sensor of the target"):
         with_sensors(clouds(), (None, sensor), "auto")  # type: ignore[arg-type]
 

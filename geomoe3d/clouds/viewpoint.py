@@ -96,6 +96,12 @@ def with_sensor(
     place = np.asarray(sensor, dtype=np.float64)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise InputError(f"the sensor of the {whose} must be three finite numbers X,Y,Z, found {sensor!r}")
+    limit = expert().loading.most_coordinate
+    if np.abs(place).max() > limit:
+        raise InputError(
+            f"the sensor of the {whose} is at {place.tolist()}, beyond the limit of {limit:g}; give X,Y,Z in the "
+            "file's coordinates"
+        )
     return replace(cloud, sensor=place, sensor_given=True)
 
 

@@ -112,7 +112,7 @@ def judge(
         return Judgement("low_confidence", (few, *notes), min(confidence, limits.most_doubted))
     if confidence < config.min_confidence:
         low = (
-            f"confidence {_said_below(confidence, config.min_confidence)} is below {config.min_confidence:.2f}: "
+            f"confidence {said_below(confidence, config.min_confidence)} is below {config.min_confidence:.2f}: "
             "the scans may not overlap, or share too little distinctive surface"
         )
         return Judgement("low_confidence", (*notes, low), confidence, low)
@@ -130,7 +130,7 @@ def _may_be_the_pattern(evidence: Evidence, rival: Hypothesis | None, informatio
     return fits and other.overlap >= limits.near_sensors_overlap
 
 
-def _said_below(confidence: float, limit: float) -> str:
+def said_below(confidence: float, limit: float) -> str:
     """Two digits as everywhere else, but never those of a limit which the number is below."""
     said = f"{confidence:.2f}"
     return said if float(said) < limit else f"{np.floor(100 * confidence) / 100:.2f}"
@@ -272,4 +272,6 @@ def confidence_score(
     if prior is not None:
         fitted = expert().confidence.fitted_prior
         strength += np.log(prior / (1 - prior)) - np.log(fitted / (1 - fitted))
+    if np.isnan(strength):  # of numbers that say nothing nothing is believed
+        return 0.0
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))

@@ -69,11 +69,10 @@ def data_remarks(
 ) -> Iterator[str]:
     """Causes, in the clouds as loaded, of an answer that is not ok; arguments as `remarks`.
 
-    Numbers that are no measurements, sensors given far away, and a voxel size far from the one that would be chosen.
+    Numbers that are no measurements, and a voxel size far from the one that would be chosen.
     """
     for loaded in clouds:
         yield from _no_data(loaded)
-        yield from _far_sensor(loaded)
     usual = choose_voxel_size(*clouds, config.voxel_points)
     most = expert().remarks.unusual_size
     if not 1 / most < wanted / usual < most:
@@ -96,17 +95,18 @@ def _no_data(cloud: PointCloud) -> Iterator[str]:
                 )
 
 
-def _far_sensor(cloud: PointCloud) -> Iterator[str]:
-    """A sentence where the user gave a sensor a place from which the cloud looks small."""
-    if not cloud.sensor_given or cloud.sensor is None:
-        return
-    place = cloud.sensor - cloud.origin
-    if not may_have_seen(cloud.points, place):
-        away = float(np.linalg.norm(place - cloud.points.mean(axis=0)))
-        yield (
-            f"the sensor of '{cloud.name}' is said to have stood {away:.4g} from it, more than the cloud is long; is "
-            "the place in the coordinates of the file?"
-        )
+def far_sensors(clouds: tuple[PointCloud, PointCloud]) -> Iterator[str]:
+    """A sentence on each sensor that the user says stood where the cloud looks small from."""
+    for cloud in clouds:
+        if not cloud.sensor_given or cloud.sensor is None:
+            continue
+        place = cloud.sensor - cloud.origin
+        if not may_have_seen(cloud.points, place):
+            away = float(np.linalg.norm(place - cloud.points.mean(axis=0)))
+            yield (
+                f"the sensor of '{cloud.name}' is said to have stood {away:.4g} from it, more than the cloud is long; "
+                "is the place in the coordinates of the file?"
+            )
 
 
 def flatness(name: str, points: FloatArray) -> str | None:

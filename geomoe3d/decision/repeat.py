@@ -12,7 +12,10 @@ import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision, Repeat
-from geomoe3d.decision.confidence import Judgement, lead_over
+from geomoe3d.decision.confidence import Judgement, lead_over, said_below
+
+_TWICE = "registered on two grids, the answers"
+_DIFFERENT = "are clearly different"
 
 
 def joined(first: Decision, second: Decision, agree: bool, least: float) -> tuple[Decision, bool]:
@@ -38,7 +41,9 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
         doubt = doubt or _named(other.judgement)  # of the same transform
     else:
         confidence = np.exp(ours) / (1 + np.exp(ours) + np.exp(theirs))
-        if best.answer is not None and other.answer is not None:
+        if doubt is not None:  # of a rival that stays the alternative
+            doubt = replace(doubt, reasons=(*doubt.reasons, f"{_TWICE} {_DIFFERENT}"))
+        elif best.answer is not None and other.answer is not None:
             lead = lead_over(best.answer.score, other.answer.score)
             best = replace(best, alternative=other.answer, lead=lead)
     if doubt is not None:
@@ -61,8 +66,8 @@ def _judged(was: Judgement, confidence: float, agree: bool, least: float) -> Jud
     reasons = tuple(reason for reason in was.reasons if reason != was.unspecific)
     if confidence >= least:
         return Judgement("ok", reasons, confidence)
-    found = "agree" if agree else "are clearly different (see the alternative)"
-    low = f"registered on two grids, the answers {found}; confidence {confidence:.2f} is below {least:.2f}"
+    found = "agree" if agree else f"{_DIFFERENT} (see the alternative)"
+    low = f"{_TWICE} {found}; confidence {said_below(confidence, least)} is below {least:.2f}"
     return Judgement("low_confidence", (*reasons, low), confidence, low)
 
 

@@ -22,8 +22,8 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
     """What is decided of a pair that has two answers: the surer one, and whether that is the second.
 
     Where they agree, the logit of the confidence is a linear function of the mean of theirs. Else both cannot be right:
-    with odds a and b it is a / (1 + a + b), and the other answer is the alternative. A cause that either names, of the
-    same transform, stays.
+    with odds a and b it is a / (1 + a + b), never ok, and the other answer is the alternative. A cause that
+    either names, of the same transform, stays.
 
     Args:
         first, second: found on different grids, with an answer each.
@@ -41,6 +41,7 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
         doubt = doubt or _named(other.judgement)  # of the same transform
     else:
         confidence = np.exp(ours) / (1 + np.exp(ours) + np.exp(theirs))
+        confidence = min(confidence, expert().confidence.most_doubted)
         if doubt is not None:  # of a rival that stays the alternative
             doubt = replace(doubt, reasons=(*doubt.reasons, f"{_TWICE} {_DIFFERENT}"))
         elif best.answer is not None and other.answer is not None:
@@ -64,10 +65,11 @@ def _named(judgement: Judgement) -> Judgement | None:
 def _judged(was: Judgement, confidence: float, agree: bool, least: float) -> Judgement:
     """A judgement that names no cause for doubt, with the confidence of both answers."""
     reasons = tuple(reason for reason in was.reasons if reason != was.unspecific)
-    if confidence >= least:
+    if agree and confidence >= least:
         return Judgement("ok", reasons, confidence)
-    found = "agree" if agree else f"{_DIFFERENT} (see the alternative)"
-    low = f"{_TWICE} {found}; confidence {said_below(confidence, least)} is below {least:.2f}"
+    low = f"{_TWICE} {_DIFFERENT} (see the alternative)"
+    if agree:
+        low = f"{_TWICE} agree; confidence {said_below(confidence, least)} is below {least:.2f}"
     return Judgement("low_confidence", (*reasons, low), confidence, low)
 
 

@@ -76,6 +76,9 @@ def test_a_cause_that_was_named_stays(status: str) -> None:
     sure = decision(0.99, status="ok")
     doubted, taken = joined(named, sure, True, 0.5)  # the same transform, of which one look knew a rival
     assert taken and doubted.judgement.status == status and doubted.judgement.confidence <= 0.79
+    rival = decision(0.5, 2.0).answer
+    told, _ = joined(replace(named, alternative=rival, lead=1.1), sure, True, 0.5)
+    assert told.alternative is rival and told.lead == 1.1  # of which the reason speaks
     sliding = decision(0.2, status=status, cause="the shared surface lets the source slide")
     assert joined(sliding, sure, True, 0.5)[0].judgement.confidence == 0.2
     other, _ = joined(named, replace(sure, answer=decision(0.99, 5.0).answer), False, 0.5)

@@ -38,7 +38,8 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
     if agree:
         fit = expert().repeat
         confidence = 1 / (1 + np.exp(-(fit.offset + fit.slope * (ours + theirs) / 2)))
-        doubt = doubt or _named(other.judgement)  # of the same transform
+        if doubt is None and (doubt := _named(other.judgement)) is not None:  # of the same transform
+            best = replace(best, alternative=other.alternative, lead=other.lead)
     else:
         confidence = np.exp(ours) / (1 + np.exp(ours) + np.exp(theirs))
         confidence = min(confidence, expert().confidence.most_doubted)

@@ -104,20 +104,6 @@ def test_where_one_place_fits_plainly_only_windows_of_rivals_are_looked_into(hou
     assert len(looked) >= expert().locating.first_windows
 
 
-@pytest.mark.parametrize(("points", "windows"), [(1000, 24), (200, 120), (20, 150)])
-def test_a_further_look_goes_into_more_windows_for_a_small_scan(house, scan, monkeypatch, points, windows):
-    counts = []
-
-    def none(self, count, within=None, *, voters=None):
-        counts.append(count)
-        return []
-
-    monkeypatch.setattr(Query, "windows", none)
-    monkeypatch.setattr(Query, "count", property(lambda self: points))
-    assert house.locate(scan[0]).status == "failed"
-    assert counts[:2] == [expert().locating.windows, windows]
-
-
 def test_a_scan_of_another_building_is_not_ok_and_is_sought_on_a_coarser_grid_too(rooms, scan):
     made = Map.empty().with_cloud(scanned(rooms[1], UTM, 2))
     made.describe(GRID / 2)

@@ -154,19 +154,6 @@ class LocatingExpert(Section):
     more_windows: int = constant(
         24, "windows", (1, 10_000), "that are looked into where the first look is not ok"
     )
-    window_points: int = constant(
-        24_000,
-        "points",
-        (10, 100_000_000),
-        "of a scan, in all windows of a further look together: of small scans more windows take no longer",
-    )
-    most_windows: int = constant(
-        150,
-        "windows",
-        (1, 10_000),
-        "of a further look",
-        "of nine small views of a building the right place was proposed for two with 24 windows, for five with this",
-    )
     plain: float = constant(
         0.65,
         "quick score",

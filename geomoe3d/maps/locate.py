@@ -123,7 +123,7 @@ class Search:
         """Distinct motions into the map with their quick scores, best first.
 
         Args:
-            more: look into twice as many windows, of small scans into more, with more matches.
+            more: look into twice as many windows, with more matches.
             near: (3,) where the scan's sensor, or its middle where none is known, is said to be, local coordinates,
                 and how far off at most.
             given: further motions (4, 4), local coordinates.
@@ -132,9 +132,7 @@ class Search:
         self._clock("places")
         within = None if near is None else (near[0], near[1] + float(np.linalg.norm(self.eye - self.center)))
         known = expert().locating
-        most = known.windows
-        if more:  # a small scan says little of where it lies, and a look into a window takes less time
-            most = min(known.most_windows, max(known.more_windows, known.window_points // self._query.count))
+        most = known.more_windows if more else known.windows
         windows = self._query.windows(math.ceil(times * most), within)
         self._clock("propose")
         scored = self._proposed(windows, near, given, times, more)

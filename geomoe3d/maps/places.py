@@ -80,11 +80,6 @@ class Query:
             np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), expert().places.reach)
         )
 
-    @property
-    def count(self) -> int:
-        """Points of the scan that are matched."""
-        return len(self._scan.points)
-
     @single_blas_thread()
     def windows(
         self,

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from geomoe3d.runtime import threads
-from geomoe3d.runtime.threads import beside, each, usable_threads
+from geomoe3d.runtime.threads import ahead, beside, each, usable_threads
 
 
 @pytest.fixture
@@ -137,3 +137,12 @@ def test_a_forked_process_has_helpers_of_its_own(three_threads):
         finally:
             os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@pytest.mark.parametrize("threads_used", ["1", "3"])
+def test_ahead_makes_each_once_and_at_most_one_more_than_was_asked_for(monkeypatch, threads_used):
+    monkeypatch.setenv("OMP_NUM_THREADS", threads_used)
+    made = []
+    of = ahead(lambda item: (made.append(item), item * 10)[1], [1, 2, 3])
+    assert of(0) == 10 and sorted(made) == ([1] if threads_used == "1" else [1, 2])
+    assert [of(k) for k in range(3)] == [10, 20, 30] and sorted(made) == [1, 2, 3]

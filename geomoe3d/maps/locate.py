@@ -10,9 +10,8 @@ those of the map did.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -31,12 +30,10 @@ from geomoe3d.maps.places import Query, Window
 from geomoe3d.maps.sight import Sight, seen_factor
 from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
-from geomoe3d.runtime.threads import beside, each, single_blas_thread, usable_threads
+from geomoe3d.runtime.threads import ahead, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 ANOTHER_STANDS = (
     "at another place the scan would be ok too, were it not for this one: rooms may be copies of each other"
 )
@@ -217,7 +214,7 @@ class Search:
         # What was known before did not convince, or it would not be asked again.
         plain = max([known.plain, *(known.better * score for score, _ in scored)]) if more else known.plain
         found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
-        motions = _ahead(lambda w: self._query.motions(w, known.per_window[more], more=more), windows)
+        motions = ahead(lambda w: self._query.motions(w, known.per_window[more], more=more), windows)
         for number, window in enumerate(windows):
             if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
                 break
@@ -389,23 +386,6 @@ def _likest(windows: Sequence[Window], center: FloatArray, reach: float) -> list
         some = [w for w, d in zip(windows, away, strict=True) if low <= d < high]
         chosen += [w for w in some if w.votes >= known.twin_share * some[0].votes][: known.twin_windows]
     return chosen
-
-
-def _ahead(function: Callable[[Item], Result], items: Sequence[Item]) -> Callable[[int], Result]:
-    """What gives ``function`` of an item by its number; that of the next one is made beside it, where a thread is idle:
-    it is wanted as a rule."""
-    made: dict[int, Result] = {}
-
-    def of(number: int) -> Result:
-        if number not in made:
-            if number + 1 < len(items) and usable_threads() > 1:
-                this, following = items[number], items[number + 1]
-                made[number], made[number + 1] = beside(lambda: function(this), lambda: function(following))
-            else:
-                made[number] = function(items[number])
-        return made[number]
-
-    return of
 
 
 def _score(candidate: tuple[float, Hypothesis]) -> float:

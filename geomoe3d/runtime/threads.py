@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import copy_context
@@ -131,6 +131,23 @@ def beside(first: Callable[[], Result], second: Callable[[], Other]) -> tuple[Re
             if not mine:
                 wait([begun])
         return found, second() if mine else begun.result()
+
+
+def ahead(function: Callable[[Item], Result], items: Sequence[Item]) -> Callable[[int], Result]:
+    """What gives ``function`` of an item by its number; that of the next one is made beside it, where a thread is idle:
+    it is wanted as a rule."""
+    made: dict[int, Result] = {}
+
+    def of(number: int) -> Result:
+        if number not in made:
+            if number + 1 < len(items) and usable_threads() > 1:
+                this, following = items[number], items[number + 1]
+                made[number], made[number + 1] = beside(lambda: function(this), lambda: function(following))
+            else:
+                made[number] = function(items[number])
+        return made[number]
+
+    return of
 
 
 @lru_cache(maxsize=1)

@@ -18,7 +18,8 @@ from geomoe3d.types import FloatArray
 
 
 class LocalCloud(NamedTuple):
-    """Points as the library holds them, with covariances where asked for, and their tree."""
+    """Points as the library holds them, with covariances where asked for, and their tree (None of no points:
+    the library would warn on its own)."""
 
     cloud: Any
     tree: Any
@@ -29,7 +30,7 @@ class LocalCloud(NamedTuple):
         import small_gicp
 
         made = small_gicp.PointCloud(points)
-        tree = small_gicp.KdTree(made, num_threads=1)
+        tree = small_gicp.KdTree(made, num_threads=1) if len(points) else None
         if num_neighbors is not None:
             # Each point's for itself: the same for any number of threads, unlike the sums of the alignment.
             small_gicp.estimate_normals_covariances(

@@ -58,7 +58,17 @@ def test_register_is_a_command_of_its_own(monkeypatch, capsys):
         (["register", "a", "b", "--voxel-size", "inf"], "finite"),
         (["register", "a", "b", "--config", "/there/is/none.yaml"], "/there/is/none.yaml"),
         (["register", "a"], "TARGET"),
-        (["register", "a", "b", "c"], "c"),
+        (["register", "a", "b", "c"], "(c); the file to write is given by --output"),
+        (
+            ["multiway", "a", "b", "--output", "c"],
+            "OUT is the last argument, as in 'geomoe3d multiway SCANS... OUT'",
+        ),
+        (
+            ["index", "a", "--output=c"],
+            "OUT.map is the last argument, as in 'geomoe3d index CLOUDS... OUT.map'",
+        ),
+        (["data", "synthesize", "-o", "c"], "-o is not an option here: OUT is the last argument"),
+        (["evaluate", "compare", "--output", "c"], "No such option"),
         (["qqqq"], "register"),
     ],
 )

@@ -12,8 +12,9 @@ from small_scans import CUTS, SETTINGS, cut, scene
 
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import load_config
+from geomoe3d.config.expert import in_force
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
-from geomoe3d.multiway.alignment import Surface, align_scans
+from geomoe3d.multiway.alignment import Surface, align_scans, chosen_neighbors
 from geomoe3d.multiway.overlaps import Overlaps
 from geomoe3d.types import PointCloud
 
@@ -65,6 +66,35 @@ def test_a_scan_that_overlaps_nothing_stays_where_it_was(surfaces):
     assert np.abs(one[3] - truth[3]).max() < 1e-12
     among = align_scans(moved_about(truth, np.random.default_rng(2), 0.01, 0.05), made, overlaps, 0.12)
     assert largest_error({k: among[k] for k in range(6)}, truth) < 0.03
+
+
+def test_a_scan_is_laid_in_so_many_others_at_most_the_nearest_and_the_farthest_among_them(surfaces):
+    made, truth, overlaps = surfaces
+    shared = {(0, k): share for k, share in enumerate([0.9, 0.5, 0.7, 0.3, 0.2], start=1)} | {(1, 0): 0.9}
+    start = moved_about({k: truth[k] for k in range(6)}, np.random.default_rng(1))
+    known = overlaps.between(start, start, 0.1)
+    with in_force(load_config(None, ["expert.many_poses.most_neighbors=3"]).expert):
+        assert chosen_neighbors(shared) == [(0, 1), (0, 2), (0, 5), (1, 0)]
+        assert len(chosen_neighbors(known)) < len(known)
+        assert largest_error(align_scans(start, made, overlaps, 0.12), truth) < 0.03
+    assert chosen_neighbors(shared) == sorted(shared)
+
+
+@pytest.mark.parametrize(("least", "asked"), [(0.0, 2), (1000.0, 1)])
+def test_it_is_asked_again_who_overlaps_whom_only_where_a_scan_moved(surfaces, least, asked):
+    made, truth, overlaps = surfaces
+    calls = []
+
+    class Counted:
+        def between(self, *given):
+            calls.append(given)
+            return overlaps.between(*given)
+
+    start = moved_about({k: truth[k] for k in range(6)}, np.random.default_rng(1))
+    with in_force(load_config(None, [f"expert.many_poses.moved_again={least}"]).expert):
+        found = align_scans(start, made, Counted(), 0.12)
+    assert len(calls) == asked
+    assert largest_error(found, truth) < 0.03
 
 
 def test_overlaps_of_many_are_the_shares_of_points_within_reach(surfaces):

@@ -109,6 +109,18 @@ def test_one_pair_is_enough_where_a_scan_is_not_placed_and_none_is_sure():
     assert mirrored_scans(asked, {**told, (5, 9): outcome(status="ok")}, {(9,)}) == {}
 
 
+def test_a_good_scan_is_not_named_for_its_pair_with_a_mirrored_one():
+    mirrored, good = (3,), (4,)
+    asked = {good: [(3, 4), (0, 4), (1, 4)], mirrored: [(0, 3), (1, 3), (3, 4)]}
+    checks = {(3, 4): outcome(MIRRORED), (0, 3): outcome(MIRRORED), (1, 3): outcome(MIRRORED)}
+    checks |= {(0, 4): outcome("too few"), (1, 4): outcome("too few")}
+    found = mirrored_scans(asked, checks, {mirrored, good})
+    assert set(found) == {3}
+    assert found[3].startswith("mirrored: 3 of 3 pairs")
+    checks[1, 4] = outcome(MIRRORED)  # a pair with a scan that is not named does count
+    assert set(mirrored_scans(asked, checks, {mirrored, good})) == {3, 4}
+
+
 def test_pairs_are_shared_out_so_that_every_part_asked_gets_as_many_as_a_verdict_needs():
     asked = {(5,): [(0, 5), (1, 5), (2, 5)], (6,): [(3, 6)], (7,): [(0, 7), (1, 7), (2, 7)]}
     needed = {(0, 5), (1, 5), (3, 6), (0, 7), (1, 7)}

@@ -44,7 +44,28 @@ _FOR_EXPERTS = {
 
 
 class Verb(click.Command):
-    """A verb in whose help the options for experts stand apart, behind the others."""
+    """A verb in whose help the options for experts stand apart, behind the others.
+
+    What fills a folder takes it as OUT, the last argument; single files go where ``--output`` says. Who writes the one
+    for the other is told which it is here.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """As click, but for what is said of OUT and ``--output``."""
+        words = " ".join(self.collect_usage_pieces(ctx)[1:]).split()
+        names = {name for option in self.params for name in option.opts}
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name in ("--output", "--out", "-o") and words and "OUT" in words[-1]:
+                said = f"{error.option_name} is not an option here: {words[-1]} is the last argument"
+                raise click.UsageError(f"{said}, as in '{ctx.command_path} {' '.join(words)}'", ctx) from None
+            raise
+        except click.UsageError as error:
+            if "unexpected extra argument" in error.message and "--output" in names:
+                said = f"{error.message}; the file to write is given by --output"
+                raise click.UsageError(said, ctx) from None
+            raise
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Both kinds, each in the order in which they were declared."""

@@ -290,7 +290,11 @@ class ManyPosesExpert(Section):
         0.02, "voxels", (0, 10), "under which no scan moved in a step, so that the reach shrinks at once"
     )
     most_pairs: int = constant(30, "pairs", (1, 10_000), "of scans, asked for two groups")
+    most_neighbors: int = constant(30, "scans", (1, 10_000), "in whose surfaces a scan is laid at most")
     neighbors_again: int = constant(5, "steps", (0, 1000), "before it is asked again who overlaps whom")
+    moved_again: float = constant(
+        0.5, "voxels", (0, 1000), "that a scan must have moved by then, or nothing new overlaps"
+    )
     gap_scale: float = constant(
         0.3333333333333333, "reach", (0.001, 100), "a gap this large counts a quarter"
     )

@@ -92,15 +92,21 @@ def align_scans(
     current = {k: np.array(poses[k]) for k in scans}
     pairs: list[Pair] = []
     asked: dict[int, IntArray] = {}
+    at: dict[int, FloatArray] = {}  # where they stood when it was asked who overlaps whom
     due, still = [0, known.neighbors_again], 0.0
     for number, reach in enumerate(known.reaches):
         if reach == still:
             continue
         if due and number >= due[0]:
             due.pop(0)
-            pairs = sorted(overlaps.between(current, current, known.least_overlap))
-            count = Counter(source for source, _ in pairs)
-            asked = {k: _thinned(chosen[k], count[k]) for k in scans}
+            moved = (_apart(current[k], at[k], centers[k], radius) for k in scans)
+            if not at or max(moved) > known.moved_again * voxel_size:
+                pairs, at = (
+                    chosen_neighbors(overlaps.between(current, current, known.least_overlap)),
+                    dict(current),
+                )
+                count = Counter(source for source, _ in pairs)
+                asked = {k: _thinned(chosen[k], count[k]) for k in scans}
         about = {k: transform_points(current[k], centers[k][None])[0] for k in scans}
         levers = {k: _lever(about[k], radius) for k in scans}
         pulls = _pulls(pairs, surfaces, asked, current, current, reach * voxel_size)
@@ -162,30 +168,56 @@ def _steps(levers: Mapping[int, FloatArray], pulls: Mapping[Pair, Pull]) -> dict
         levers: (6, 6) by scan, from `_lever`; in their units are the motions.
         pulls: of the pairs: the source is drawn by the slope, the target pulled back.
     """
-    from scipy.sparse import coo_matrix, identity
-    from scipy.sparse.linalg import spsolve
+    from scipy.sparse import bsr_matrix, identity
+    from scipy.sparse.linalg import splu
 
     if not pulls:
         return {}
     place, L = {scan: n for n, scan in enumerate(levers)}, np.stack(list(levers.values()))
-    ends = np.array([[place[scan] for scan in pair] for pair in pulls])
+    ends, count = np.array([[place[scan] for scan in pair] for pair in pulls]), len(L)
     A, b = (np.stack(some) for some in zip(*pulls.values(), strict=True))
-    slope = np.zeros((len(L), 6))
+    slope = np.zeros((count, 6))
     keys, blocks = [], []
     for one, sign in ((ends[:, 0], 1.0), (ends[:, 1], -1.0)):
         lever = L[one].transpose(0, 2, 1)
         np.add.at(slope, one, sign * (lever @ b[:, :, None])[:, :, 0])
         for other, same in ((ends[:, 0], 1.0), (ends[:, 1], -1.0)):
-            keys.append(np.column_stack([one, other]))
+            keys.append(count * one + other)
             blocks.append(sign * same * lever @ A @ L[other])
-    where, count = 6 * np.concatenate(keys)[:, :, None, None] + np.mgrid[:6, :6], 6 * len(L)
-    rows, columns = where.transpose(1, 0, 2, 3).reshape(2, -1)
-    H = coo_matrix((np.concatenate(blocks).ravel(), (rows, columns)), shape=(count, count)).tocsc()
+    # What pairs say of the same two scans is summed first: there are far more pairs than blocks.
+    key = np.concatenate(keys)
+    order = np.argsort(key, kind="stable")
+    known, starts = np.unique(key[order], return_index=True)
+    sums = np.add.reduceat(np.concatenate(blocks)[order], starts, axis=0)
+    rows = np.searchsorted(known, count * np.arange(count + 1))
+    H = bsr_matrix((sums, known % count, rows), shape=(6 * count,) * 2).tocsc()
     damping = expert().many_poses.damping * float(H.diagonal().mean())
     if damping <= 0:  # nothing overlaps
         return {}
-    found = spsolve(H + damping * identity(count, format="csc"), slope.ravel()).reshape(-1, 6)
+    H = H + damping * identity(6 * count, format="csc")
+    solved = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    found = solved.solve(slope.ravel()).reshape(-1, 6)
     return {scan: found[n] for scan, n in place.items()}
+
+
+def chosen_neighbors(shared: Mapping[Pair, float]) -> list[Pair]:
+    """The pairs (source, target) to lay on each other: of every source so many at most.
+
+    They are taken evenly from those that it overlaps most to those that it overlaps least: with the nearest alone scans
+    of one place would hold each other and let go of the next place. So time is linear in the scans, however many stand
+    in one place.
+    """
+    most, some = expert().many_poses.most_neighbors, dict[int, list[Pair]]()
+    for pair in sorted(shared, key=lambda pair: (-shared[pair], pair)):
+        some.setdefault(pair[0], []).append(pair)
+    taken = [np.unique(np.linspace(0, len(lot) - 1, most).astype(np.int64)) for lot in some.values()]
+    return sorted(lot[k] for lot, rows in zip(some.values(), taken, strict=True) for k in rows)
+
+
+def _apart(one: FloatArray, other: FloatArray, center: FloatArray, radius: float) -> float:
+    """How far two poses put a scan apart at most, about: its centre, and what a turn moves at its rim."""
+    D = one[:3] - other[:3]
+    return float(np.linalg.norm(D[:, :3] @ center + D[:, 3]) + radius * np.linalg.norm(D[:, :3]))
 
 
 def _thinned(rows: IntArray, neighbors: int) -> IntArray:
@@ -205,16 +237,16 @@ def _pulls(
     """Curvature (6, 6) and slope (6,), about the group's origin, by which each source is drawn into its target.
 
     Args:
-        pairs: (source, target); all of them, since with the nearest alone scans of one place would hold each other
-            and let go of the next place.
+        pairs: (source, target).
         surfaces: of all scans.
         asked: (n,) points by source.
         sources, targets: poses (4, 4) in the group's frame.
         reach: points farther from the target do not count, cloud units.
     """
     known, found = expert().many_poses, {}
-    points = {k: transform_points(sources[k], surfaces[k].points[asked[k]]) for k, _ in pairs}
-    normals = {k: surfaces[k].normals[asked[k]] @ sources[k][:3, :3].T for k, _ in pairs}
+    drawing = dict.fromkeys(k for k, _ in pairs)
+    points = {k: transform_points(sources[k], surfaces[k].points[asked[k]]) for k in drawing}
+    normals = {k: surfaces[k].normals[asked[k]] @ sources[k][:3, :3].T for k in drawing}
     square = (known.gap_scale * reach) ** 2
     drawn: dict[int, list[int]] = {}
     for source, number in pairs:

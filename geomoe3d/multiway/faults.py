@@ -132,18 +132,26 @@ def mirrored_scans(
         unplaced: parts of scans that are in no group.
     """
     found: dict[int, str] = {}
-    for part, pairs in asked.items():
-        told = [checks[pair] for pair in pairs if pair in checks]
-        said = [sentence for outcome in told if (sentence := _said(outcome, MIRRORED))]
-        against = sum(outcome.status == "ok" for outcome in told)
-        alone = len(pairs) == 1 or (part in unplaced and len(told) > 1)
-        if len(said) > max(against, 0 if alone else 1):
-            text = (
-                f"{MIRRORED}: {len(said)} of {counted(len(told), 'pair')} {'fit' if len(said) > 1 else 'fits'} clearly "
-                "better with one of the two scans mirrored; if the axes of this one are left-handed (often two are "
-                "exchanged), bring them to right-handed ones"
-            )
-            found |= dict.fromkeys(part, text)
+    left = dict(asked)
+    while left:
+        # Both scans of a pair are said to be mirrored. The worst part is named first; its pairs accuse no other then.
+        worst, most, text = None, 0, ""
+        for part, pairs in left.items():
+            clean = [pair for pair in pairs if pair in checks and found.keys().isdisjoint({*pair} - {*part})]
+            said = sum(bool(_said(checks[pair], MIRRORED)) for pair in clean)
+            against = sum(checks[pair].status == "ok" for pair in clean)
+            alone = len(pairs) == 1 or (part in unplaced and len(clean) > 1)
+            if said > max(against, 0 if alone else 1) and said - against > most:
+                worst, most = part, said - against
+                text = (
+                    f"{MIRRORED}: {said} of {counted(len(clean), 'pair')} {'fit' if said > 1 else 'fits'} clearly "
+                    "better with one of the two scans mirrored; if the axes of this one are left-handed (often two are "
+                    "exchanged), bring them to right-handed ones"
+                )
+        if worst is None:
+            break
+        found |= dict.fromkeys(worst, text)
+        del left[worst]
     return found
 
 

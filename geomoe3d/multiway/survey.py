@@ -24,7 +24,7 @@ from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import FormatError, GeoMoE3DError, InputError
 from geomoe3d.geometry.se3 import inverse, shift_frames
 from geomoe3d.multiway.alignment import Surface
-from geomoe3d.multiway.edges import Edge, Shape, edge_of, predicted_motion
+from geomoe3d.multiway.edges import Edge, Shape, edge_of
 from geomoe3d.multiway.free_space import FreeSpace
 from geomoe3d.multiway.initial import InitialPoses
 from geomoe3d.multiway.maps import MAPS_FOLDER, MapPair, map_pairs, whole_pairs, write_map
@@ -226,17 +226,12 @@ class Survey:
 
     def _closing_pairs(self, group: Group) -> set[PairKey]:
         """Of every scan, the untried pairs that the poses say to overlap most."""
-        chosen: set[PairKey] = set()
-        scans = sorted(group.poses)
-        for j in scans:
-            found = []
-            for i in scans:
-                if i < j and (i, j) not in self.outcomes:
-                    overlap = self.overlaps.of(j, i, predicted_motion(j, i, group.poses))
-                    if overlap > expert().many_pairs.closing_overlap:
-                        found.append((-overlap, i))
-            chosen |= {(i, j) for _, i in sorted(found)[: expert().many_pairs.closing_per_scan]}
-        return chosen
+        limits, found = expert().many_pairs, dict[int, list[tuple[float, int]]]()
+        shared = self.overlaps.between(group.poses, group.poses, limits.closing_overlap)
+        for (j, i), overlap in shared.items():
+            if i < j and (i, j) not in self.outcomes and overlap > limits.closing_overlap:
+                found.setdefault(j, []).append((-overlap, i))
+        return {(i, j) for j, some in found.items() for _, i in sorted(some)[: limits.closing_per_scan]}
 
     def map_pairs(self, groups: list[Group], edges: Sequence[Edge]) -> list[MapPair]:
         """Pairs of local maps that could tie groups which are still apart.

@@ -26,11 +26,11 @@ from geomoe3d.decision.choosers import have_margin
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
 from geomoe3d.decision.information import distance_under
-from geomoe3d.decision.parallel import made_parallel
+from geomoe3d.decision.parallel import Parallel
 from geomoe3d.decision.remarks import data_remarks, far_sensors, remarks
 from geomoe3d.decision.repeat import joined
 from geomoe3d.decision.scale import UNITS_DIFFER, Scale, measure_scale
-from geomoe3d.decision.selection import Selection, are_different, surfaces_of
+from geomoe3d.decision.selection import Selection, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.features.base import mirrored
 from geomoe3d.geometry.se3 import inverse
@@ -44,23 +44,21 @@ from geomoe3d.types import Accuracy, FilterOutput, FloatArray, Hypothesis, Point
 
 class Look(NamedTuple):
     """What one look at a pair gave: the clouds and matches that were judged, what the filter said, the decision, and
-    what measures where the clouds lie on each other."""
+    what makes its transforms parallel."""
 
     pair: Pair
     weighed: FilterOutput
     decision: Decision
-    shared: SharedSurface
+    parallel: Parallel
 
     def scale(self) -> Scale | None:
         """See `measure_scale`."""
-        return measure_scale(self.decision.T_target_source, self.shared)
+        return measure_scale(self.decision.T_target_source, self.parallel.shared)
 
     def accuracy(self) -> Accuracy | None:
         """See `measure_accuracy`."""
-        pair = self.pair
-        return measure_accuracy(
-            self.decision.T_target_source, self.shared, pair.matched, pair.inlier_threshold
-        )
+        T, shared = self.decision.T_target_source, self.parallel.shared
+        return measure_accuracy(T, shared, self.pair.matched, self.pair.inlier_threshold)
 
 
 @dataclass
@@ -187,11 +185,10 @@ class Line:
         if other.decision.answer is None:
             nothing = "registered once more on a shifted grid, no transform was found"
             return look._replace(decision=look.decision.doubted(nothing))
-        shift = expert().selection.different_shift * look.pair.inlier_threshold
-        found = look.decision.T_target_source, other.decision.T_target_source
-        agree = not are_different(*found, look.pair.clouds[0], shift)
-        least = max(self.config.decision.min_confidence, self.config.second_look.min_confidence)
-        decision, taken = joined(look.decision, other.decision, agree, least)
+        decisions, wanted = (look.decision, other.decision), self.config.decision
+        agree = not look.parallel.differ(*(decision.T_target_source for decision in decisions))
+        least = max(wanted.min_confidence, self.config.second_look.min_confidence)
+        decision, taken = joined(*decisions, agree, least, wanted.prior)
         return (other if taken else look)._replace(decision=decision)
 
     def _mirrored_agreement(self, prepared: Clouds, places: Places) -> Callable[[], float]:
@@ -243,7 +240,7 @@ class Line:
             config = stricter if again else self.config
             choosing = line.second_scorers if again else {}
             refine = polish if line.refiner.needs_clouds else line.refiner.about(pair)
-            selection = Selection(pair, line.scorers, refine, config, clock, choosing, known)
+            selection = Selection(pair, line.scorers, refine, config, clock, choosing, known, parallel)
             selection.add(proposed)
             if rivals is not None:
                 selection.add(rivals.transforms())
@@ -255,14 +252,14 @@ class Line:
         decide = self.config.decision.model_copy(update={"min_confidence": least})
         stricter = self.config.model_copy(update={"decision": decide})
 
-        def needed_later() -> tuple[PairScorer, SharedSurface]:
-            surfaces, shared = surfaces_of(pair, line.scorers), SharedSurface(*pair.clouds)
-            if self.config.refinement.parallel:
-                shared.directions  # noqa: B018 - kept there
-            return surfaces, shared
+        def needed_later() -> tuple[PairScorer, Parallel]:
+            surfaces, parallel = surfaces_of(pair, line.scorers), self._parallel(pair)
+            if parallel.wanted:
+                parallel.shared.directions  # noqa: B018 - kept there
+            return surfaces, parallel
 
         # Proposing keeps one thread busy most of the time.
-        (weighed, proposed), (surfaces, shared) = beside(lambda: line.propose(pair, clock), needed_later)
+        (weighed, proposed), (surfaces, parallel) = beside(lambda: line.propose(pair, clock), needed_later)
         with single_blas_thread():
             selection, looks = select(pair, proposed, surfaces), [pair]
             decision = selection.decide()
@@ -288,7 +285,7 @@ class Line:
                     for further in chain(more, coarser):
                         selection.add(line.propose(further, clock)[1])
                 decision = selection.decide(look.num_refined, look.num_judged)
-        return Look(pair, weighed, decision, shared)
+        return Look(pair, weighed, decision, parallel)
 
     def _is_described_again(self, pair: Pair, decision: Decision) -> bool:
         """Whether the second descriptor is to be asked: of an answer that is not ok, or may be wrong all the same."""
@@ -341,13 +338,15 @@ class Line:
         inliers = decision.residuals(pair.matched) < pair.inlier_threshold
         return Explanation(result, *clouds, pair.matched, weighed, inliers, decision.hypotheses)
 
+    def _parallel(self, pair: Pair) -> Parallel:
+        """What makes transforms of a pair parallel, where that is wanted."""
+        wanted = self.config.refinement
+        clouds = wanted.parallel and wanted.name in ("gicp", "icp")
+        return Parallel(SharedSurface(*pair.clouds), pair.inlier_threshold, clouds)
+
     def _made_parallel(self, look: Look) -> Decision:
         """The decision with its answer made parallel, where that is wanted, and how accurate it then is."""
-        wanted, T = self.config.refinement, look.decision.T_target_source
-        if wanted.parallel and wanted.name in ("gicp", "icp"):
-            look = look._replace(
-                decision=look.decision.moved(made_parallel(T, look.shared, look.pair.inlier_threshold))
-            )
+        look = look._replace(decision=look.decision.moved(look.parallel))
         return replace(look.decision, accuracy=look.accuracy())
 
     def _units(self, clouds: tuple[PointCloud, PointCloud]) -> str | None:
@@ -375,7 +374,7 @@ class Line:
         for remark in clouds[1].notes:
             decision = decision.with_note(remark)
         weighed = FilterOutput(np.zeros(len(found.pair.matched)))
-        return self._finished(Look(found.pair, weighed, decision, SharedSurface(*found.pair.clouds)), clouds)
+        return self._finished(Look(found.pair, weighed, decision, self._parallel(found.pair)), clouds)
 
 
 def _on_each_other(places: Places, look: Look) -> bool:

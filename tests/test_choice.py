@@ -13,7 +13,8 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import RegistrationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
-from geomoe3d.decision.selection import Selection, distinct
+from geomoe3d.decision.distinct import distinct
+from geomoe3d.decision.selection import Selection
 from geomoe3d.features.base import with_features
 from geomoe3d.features.fpfh import FpfhDescriptor
 from geomoe3d.geometry.se3 import make_transform, rotation_error_deg

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surface_pairs import motion, pair, perturbation, prepared, surfaces
 
-from geomoe3d.decision.parallel import made_parallel, with_right_angles
+from geomoe3d.decision.parallel import Parallel, made_parallel, with_right_angles
 from geomoe3d.decision.shared_surface import SharedSurface, main_directions
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
 
@@ -62,6 +62,22 @@ def test_a_loose_answer_is_made_parallel() -> None:
         found = made_parallel(start, SharedSurface(*clouds), 2 * VOXEL)
         assert rotation_error_deg(start, truth) == pytest.approx(6, abs=1e-6)
         assert rotation_error_deg(found, truth) < 2.5
+
+
+def test_transforms_that_become_one_are_not_different() -> None:
+    source, target = two_views()
+    clouds = prepared(source), prepared(target)
+    truth = np.eye(4)
+    truth[:3, 3] = clouds[0].origin - clouds[1].origin
+    middle = np.array([4.5, 1.5, 0.0]) - clouds[1].origin
+    one, other = (perturbation(np.radians([0, turn, 0]), np.zeros(3), middle) @ truth for turn in (-7.8, 7.8))
+    shared = SharedSurface(*clouds)
+    parallel = Parallel(shared, 2 * VOXEL)
+    assert rotation_error_deg(one, other) > 15 and not parallel.differ(one, other)
+    assert rotation_error_deg(parallel(one), parallel(other)) < 5
+    assert Parallel(shared, 2 * VOXEL, wanted=False).differ(one, other)
+    far = perturbation(np.radians([0, 0, 90]), np.zeros(3), middle) @ truth
+    assert parallel.differ(one, far) and not parallel.differ(one, one)
 
 
 def test_a_firm_answer_stays_whatever_is_askew() -> None:

@@ -11,7 +11,7 @@ from geomoe3d.clouds.prepare import prepare
 from geomoe3d.config import PreparationConfig, expert, load_config
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.answer import Decision
-from geomoe3d.decision.confidence import Judgement
+from geomoe3d.decision.confidence import Judgement, prior_logit
 from geomoe3d.decision.information import Information
 from geomoe3d.decision.repeat import joined
 from geomoe3d.geometry.draws import OFF_ROUND
@@ -44,6 +44,21 @@ def test_two_answers_that_agree_are_as_sure_as_the_mean_of_their_logits() -> Non
     expected = fit.offset + fit.slope * np.log(odds(0.9) * odds(0.98)) / 2
     assert taken and np.log(odds(found.judgement.confidence)) == pytest.approx(expected)
     assert found.repeat is not None and (found.repeat.first, found.repeat.second) == (0.9, 0.98)
+
+
+def test_a_prior_is_counted_once() -> None:
+    fit = expert().repeat
+    for prior in (0.2, 0.99):
+        added = prior_logit(prior)
+        both = [1 / (1 + np.exp(-(strength + added))) for strength in (1.5, 2.5)]
+        agreed, _ = joined(decision(both[0]), decision(both[1]), True, 0.95, prior)
+        expected = fit.offset + fit.slope * 2.0 + added
+        assert np.log(odds(agreed.judgement.confidence)) == pytest.approx(expected)
+        low = [1 / (1 + np.exp(-(strength + added))) for strength in (-4.0, -5.0)]
+        differing, _ = joined(decision(low[0]), decision(low[1], 5.0), False, 0.95, prior)
+        for_that_mix = np.exp([-4.0 + added, -5.0 + added])
+        assert differing.judgement.confidence == pytest.approx(for_that_mix[0] / (1 + for_that_mix.sum()))
+    assert prior_logit(None) == 0 and prior_logit(expert().confidence.fitted_prior) == 0
 
 
 def test_two_that_agree_well_enough_are_ok_and_say_no_more_that_one_was_unsure() -> None:

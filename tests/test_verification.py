@@ -15,7 +15,8 @@ from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.clouds.viewpoint import find_viewpoints
 from geomoe3d.config import PreparationConfig, RegistrationConfig
 from geomoe3d.data.sample import make_sample_pair
-from geomoe3d.decision.selection import Selection, are_different, distinct
+from geomoe3d.decision.distinct import are_different, distinct
+from geomoe3d.decision.selection import Selection
 from geomoe3d.errors import InputError
 from geomoe3d.features.base import with_features
 from geomoe3d.features.fpfh import FpfhDescriptor

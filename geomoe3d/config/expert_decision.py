@@ -39,6 +39,9 @@ class SelectionExpert(Section):
     different_turn_deg: float = constant(
         15.0, "degrees", (0.1, 180), "turn from which two transforms are different", "limit of the benchmark"
     )
+    far_apart: float = constant(
+        3.0, "factor", (1, 100), "times both, from which transforms are not made parallel to be compared"
+    )
     most_unrefined: float = constant(
         0.5,
         "probability",

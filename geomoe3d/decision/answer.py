@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -89,11 +90,13 @@ class Decision:
         both = (h for h in (self.answer, self.alternative) if h is not None)
         return [h.anew() for h in both]
 
-    def moved(self, T_target_source: FloatArray) -> Decision:
-        """The same decision with the answer's transform (4, 4) drawn closer; what was said of it stays."""
-        if self.answer is None:
-            return self
-        return replace(self, answer=replace(self.answer, T_target_source=T_target_source))
+    def moved(self, parallel: Callable[[FloatArray], FloatArray]) -> Decision:
+        """The same decision, answer and alternative made parallel; what was said of them stays."""
+        answer, other = (
+            None if h is None else replace(h, T_target_source=parallel(h.T_target_source))
+            for h in (self.answer, self.alternative)
+        )
+        return replace(self, answer=answer, alternative=other)
 
     def with_note(self, note: str, *, first: bool = False) -> Decision:
         """The same decision with one more sentence among the reasons, at their end or before them."""

@@ -269,9 +269,15 @@ def confidence_score(
         strength = second.offset + np.array([second.evidence, second.margin]) @ margin_inputs(
             strength, margin
         )
-    if prior is not None:
-        fitted = expert().confidence.fitted_prior
-        strength += np.log(prior / (1 - prior)) - np.log(fitted / (1 - fitted))
+    strength += prior_logit(prior)
     if np.isnan(strength):  # of numbers that say nothing nothing is believed
         return 0.0
     return float(1 / (1 + np.exp(-np.clip(strength, -50, 50))))
+
+
+def prior_logit(prior: float | None) -> float:
+    """What a prior, P(a pair overlaps), adds to the logit of a confidence; 0 where none is given."""
+    if prior is None:
+        return 0.0
+    fitted = expert().confidence.fitted_prior
+    return float(np.log(prior / (1 - prior)) - np.log(fitted / (1 - fitted)))

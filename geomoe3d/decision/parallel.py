@@ -9,15 +9,52 @@ those of laser scans and of bodies do, nothing moves. About 10 ms.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.decision.accuracy import covariance_of
+from geomoe3d.decision.distinct import are_different
 from geomoe3d.decision.shared_surface import SharedSurface
-from geomoe3d.geometry.se3 import cross_matrix, make_transform
+from geomoe3d.geometry.se3 import cross_matrix, make_transform, motions_apart
 from geomoe3d.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Parallel:
+    """Transforms of one pair as they are reported: made parallel, each once.
+
+    Attributes:
+        shared: of both clouds.
+        threshold: of an inlier, cloud units.
+        wanted: False leaves every transform as it is.
+    """
+
+    shared: SharedSurface
+    threshold: float
+    wanted: bool = True
+    _known: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __call__(self, T_target_source: FloatArray) -> FloatArray:
+        """The transform (4, 4) made parallel; see `made_parallel`."""
+        if not self.wanted:
+            return T_target_source
+        key = T_target_source.tobytes()
+        if key not in self._known:
+            self._known[key] = made_parallel(T_target_source, self.shared, self.threshold)
+        return self._known[key]
+
+    def differ(self, T_a: FloatArray, T_b: FloatArray) -> bool:
+        """Whether two transforms (4, 4) are clearly different, as they are and made parallel; see `are_different`."""
+        known, source = expert().selection, self.shared.source
+        most = known.different_shift * self.threshold
+        if not are_different(T_a, T_b, source, most):
+            return False
+        shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
+        farther = shift > known.far_apart * most or turn > known.far_apart * known.different_turn_deg
+        return not self.wanted or farther or are_different(self(T_a), self(T_b), source, most)
 
 
 def made_parallel(T_target_source: FloatArray, shared: SharedSurface, threshold: float) -> FloatArray:

@@ -12,23 +12,26 @@ import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision, Repeat
-from geomoe3d.decision.confidence import Judgement, lead_over, said_below
+from geomoe3d.decision.confidence import Judgement, lead_over, prior_logit, said_below
 
 _TWICE = "registered on two grids, the answers"
 _DIFFERENT = "are clearly different"
 
 
-def joined(first: Decision, second: Decision, agree: bool, least: float) -> tuple[Decision, bool]:
+def joined(
+    first: Decision, second: Decision, agree: bool, least: float, prior: float | None = None
+) -> tuple[Decision, bool]:
     """What is decided of a pair that has two answers: the surer one, and whether that is the second.
 
-    Where they agree, the logit of the confidence is a linear function of the mean of theirs. Else both cannot be right:
-    with odds a and b it is a / (1 + a + b), never ok, and the other answer is the alternative. A cause that
-    either names, of the same transform, stays.
+    Where they agree, the logit of the confidence is a linear function of the mean of theirs, each as it is for the mix
+    of the fit: what a prior adds is added once. Else both cannot be right: with odds a and b it is a / (1 + a + b),
+    never ok, and the other answer is the alternative. A cause that either names, of the same transform, stays.
 
     Args:
         first, second: found on different grids, with an answer each.
         agree: whether their transforms are not clearly different.
         least: confidence from which an answer is ok.
+        prior: that both confidences were made with, see `confidence_score`.
     """
     said = Repeat(first.judgement.confidence, second.judgement.confidence, agree)
     taken = second.judgement.confidence > first.judgement.confidence
@@ -36,8 +39,9 @@ def joined(first: Decision, second: Decision, agree: bool, least: float) -> tupl
     ours, theirs = (logit(decision.judgement.confidence) for decision in (best, other))
     doubt = _named(best.judgement)
     if agree:
-        fit = expert().repeat
-        confidence = 1 / (1 + np.exp(-(fit.offset + fit.slope * (ours + theirs) / 2)))
+        fit, added = expert().repeat, prior_logit(prior)
+        strength = fit.offset + fit.slope * ((ours + theirs) / 2 - added) + added
+        confidence = 1 / (1 + np.exp(-strength))
         if doubt is None and (doubt := _named(other.judgement)) is not None:  # of the same transform
             best = replace(best, alternative=other.alternative, lead=other.lead)
     else:

@@ -7,7 +7,7 @@ hypothesis itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -19,14 +19,16 @@ from geomoe3d.config import DecisionConfig, RegistrationConfig, expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.choosers import Choosers
 from geomoe3d.decision.confidence import Judgement, judge, lead_over
+from geomoe3d.decision.distinct import are_different, distinct
 from geomoe3d.decision.information import measure_information
+from geomoe3d.decision.parallel import Parallel
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
 from geomoe3d.refinement.base import PairRefiner
 from geomoe3d.runtime.threads import each
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.scoring.base import PairScorer, Scorer
 from geomoe3d.scoring.surfaces import SURFACES, SurfaceScorer, evidence_of
-from geomoe3d.types import BoolArray, FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import FloatArray, Hypothesis
 
 _UNREFINED = (
     "the answer could not be refined without fitting less well, and where the sensors stood is not known; right "
@@ -49,6 +51,8 @@ class Selection:
             they prefer it to the best clearly different candidate, the margin, makes the confidence; score and lead
             know nothing of them.
         surfaces: `surfaces_of` the pair, where somebody has them already.
+        parallel: by which answers are made parallel in the end, and rivals compared as they then are; None: they stay
+            as they are.
     """
 
     def __init__(
@@ -60,9 +64,11 @@ class Selection:
         clock: StageClock,
         choosing: Mapping[str, Scorer] = MappingProxyType({}),
         surfaces: PairScorer | None = None,
+        parallel: Parallel | None = None,
     ) -> None:
         self._pair, self._scorers, self._config, self._clock = pair, scorers, config, clock
-        self._source, self._choosers = pair.clouds[0], Choosers(choosing, pair, self._differ)
+        self._source, self._choosers = pair.clouds[0], Choosers(choosing, pair, self._are_apart)
+        self._parallel = parallel
         self._bound: dict[str, PairScorer] = {SURFACES: surfaces or surfaces_of(pair, scorers)}
         self._refiner = refiner
         self._first: Hypothesis | None = None
@@ -138,7 +144,7 @@ class Selection:
         self._clock("refine")
         different = (h for h in self.hypotheses if self._differ(answer, h))
         others = self._refine_all(distinct(different, self._source, self._shift, count))
-        margin = Choosers(choosing, pair, self._differ).margin(answer, [*others, decision.alternative])
+        margin = Choosers(choosing, pair, self._are_apart).margin(answer, [*others, decision.alternative])
         if margin is None:
             return decision
         return self._judged(answer, decision.alternative, decision.lead, margin, limits)
@@ -299,14 +305,14 @@ class Selection:
         best: Hypothesis | None = None
         different = (h for h in self.hypotheses if self._differ(answer, h))
         others = distinct(different, self._source, self._shift, expert().selection.most_rivals)
-        # A fair race: a rival that could matter is refined too. One that refines to the answer itself was only proposed
-        # less well, and is none: how far off it was proposed is an accident.
+        # A fair race: a rival that could matter is refined too. One that refines to the answer itself, or becomes it
+        # once both are made parallel, was only proposed less well, and is none: how far off is an accident.
         most_lead = expert().confidence.most_lead
         close = [h for h in others if lead_over(answer.score, h.score) < most_lead]
         polished = dict(zip(map(id, close), self._refine_all(close), strict=True))
         for other in others:
             refined = polished.get(id(other), other)
-            if not self._differ(answer, refined):
+            if not self._are_apart(answer, refined):
                 continue
             other = max(other, refined, key=lambda h: h.score)
             if best is None or other.score > best.score:
@@ -315,6 +321,12 @@ class Selection:
 
     def _differ(self, one: Hypothesis, other: Hypothesis) -> bool:
         return are_different(one.T_target_source, other.T_target_source, self._source, self._shift)
+
+    def _are_apart(self, one: Hypothesis, other: Hypothesis) -> bool:
+        """Whether two hypotheses are clearly different, as they are and as they would be reported."""
+        if self._parallel is None:
+            return self._differ(one, other)
+        return self._parallel.differ(one.T_target_source, other.T_target_source)
 
     def _overruled(self, answer: Hypothesis) -> str | None:
         """A sentence where the answer is clearly another transform than the user's first guess, refined."""
@@ -343,38 +355,3 @@ def surfaces_of(pair: Pair, scorers: Mapping[str, Scorer]) -> PairScorer:
     """What asks the clouds of a pair about hypotheses, as the scorers do or, where none of them asks clouds, as is
     usual."""
     return scorers.get(SURFACES, SurfaceScorer()).about(pair)
-
-
-def distinct(
-    ranked: Iterable[Hypothesis], source: PreparedCloud, max_shift: float, limit: int
-) -> list[Hypothesis]:
-    """The best hypotheses that are all different transforms, at most ``limit``; see `are_different`."""
-    given, center = list(ranked), source.points.mean(0)
-    transforms = np.array([h.T_target_source for h in given]).reshape(-1, 4, 4)
-    left, chosen = np.ones(len(given), dtype=np.bool_), list[Hypothesis]()
-    while left.any() and len(chosen) < limit:
-        best = int(left.argmax())
-        chosen.append(given[best])
-        left[best] = False
-        left &= _differing(transforms[best], transforms, center, max_shift)
-    return chosen
-
-
-def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_shift: float) -> bool:
-    """Whether two transforms (4, 4) are clearly different.
-
-    Args:
-        T_a, T_b: target from source.
-        source: its centroid is where shifts are measured.
-        max_shift: transforms closer than this, cloud units, and closer than 15 degrees are the same.
-    """
-    return bool(_differing(T_a, T_b[None], source.points.mean(0), max_shift)[0])
-
-
-def _differing(T: FloatArray, others: FloatArray, center: FloatArray, max_shift: float) -> BoolArray:
-    """(K,) `are_different` of one transform (4, 4) and others (K, 4, 4); shifts of a point (3,) of the source."""
-    shifts = np.linalg.norm((others - T)[:, :3] @ np.append(center, 1.0), axis=1)
-    traces = np.einsum("kij,ij->k", others[:, :3, :3], T[:3, :3])
-    least = 1 + 2 * np.cos(np.radians(expert().selection.different_turn_deg))
-    found: BoolArray = (shifts > max_shift) | (traces < least)
-    return found

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from geomoe3d.clouds.viewpoint import known_viewpoints
 from geomoe3d.clouds.voxel_size import own_voxel_sizes, round_size
 from geomoe3d.data.collection import PosedPair, load_fragment, open_collection
-from geomoe3d.decision.selection import distinct
+from geomoe3d.decision.distinct import distinct
 from geomoe3d.features.base import with_features
 from geomoe3d.geometry.se3 import inverse, motions_apart, shift_frames, transform_points
 from geomoe3d.pipeline import Pipeline

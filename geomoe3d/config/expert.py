@@ -25,6 +25,7 @@ from geomoe3d.config.expert_decision import (
     SelectionExpert,
     SharedSurfaceExpert,
     SimilarityExpert,
+    TwinsExpert,
 )
 from geomoe3d.config.expert_maps import LocatingExpert, MapsExpert, PlacesExpert
 from geomoe3d.config.expert_multiway import ManyGroupsExpert, ManyPairsExpert, ManyPosesExpert
@@ -54,6 +55,7 @@ class ExpertConfig(Section):
 
     correspondences: CorrespondencesExpert = CorrespondencesExpert()
     selection: SelectionExpert = SelectionExpert()
+    twins: TwinsExpert = TwinsExpert()
     confidence: ConfidenceExpert = ConfidenceExpert()
     repeat: RepeatExpert = RepeatExpert()
     shared_surface: SharedSurfaceExpert = SharedSurfaceExpert()

@@ -51,6 +51,43 @@ class SelectionExpert(Section):
     )
 
 
+class TwinsExpert(Section):
+    """Other places that look like the answer's (`decision/twins.py`, `decision/selection.py`)."""
+
+    least_behind: float = constant(
+        0.01,
+        "share",
+        (0, 1),
+        "of the points that a scan which looks all around has behind the sensor, seen along its mean ray",
+        "none of 80 fragments of depth cameras, 0.01 and more of scanners in rooms",
+    )
+    cell: float = constant(2.0, "voxels", (0.5, 20), "edge of the cells that are laid on each other")
+    least_shift: float = constant(
+        3.0, "cells", (0, 100), "by which a place that is not turned is another one"
+    )
+    most_shifts: int = constant(3, "shifts", (1, 100), "of each turn that are looked at")
+    most_asked: int = constant(
+        12, "transforms", (1, 1000), "under which most cells coincide, that the clouds are asked about"
+    )
+    least_common: float = constant(
+        0.5, "ratio", (0, 1), "of the cells that coincide to those under the answer, below which none is"
+    )
+    most_refined: int = constant(3, "transforms", (1, 20), "that the clouds like best are refined")
+    least_proposed: float = constant(
+        0.2, "ratio", (0, 1), "of the answer's surface score from which a transform is refined"
+    )
+    least_score: float = constant(
+        0.4,
+        "ratio",
+        (0, 1),
+        "of the answer's surface score from which a refined one makes it ambiguous",
+        "0.44 to 0.96 of 20 wrong answers that were ok in generated places that repeat",
+    )
+    believed: float = constant(
+        0.95, "probability", (0, 1), "that the clouds alone give it if the answer were not there"
+    )
+
+
 class SharedSurfaceExpert(Section):
     """Where two clouds lie on each other (`decision/shared_surface.py`)."""
 

@@ -119,6 +119,23 @@ def judge(
     return Judgement("ok", tuple(notes), confidence)
 
 
+def is_likely(judgement: Judgement) -> bool:
+    """Whether an answer is ok, or may become so where it comes out again."""
+    return judgement.status == "ok" or (
+        judgement.unspecific is not None and judgement.confidence >= expert().confidence.likely
+    )
+
+
+def repeated(was: Judgement, lead: float) -> Judgement:
+    """The judgement of an answer beside which the clouds would believe another one as well; ``lead`` by them alone."""
+    twin = (
+        f"the place repeats: by the surfaces alone a clearly different transform does {100 / lead:.0f} % as well and "
+        "would be believed by itself; see the alternative"
+    )
+    others = (reason for reason in was.reasons if reason != was.unspecific)
+    return Judgement("ambiguous", (twin, *others), min(was.confidence, expert().confidence.most_doubted))
+
+
 def _may_be_the_pattern(evidence: Evidence, rival: Hypothesis | None, information: Information) -> bool:
     """Whether an answer lays sensor on sensor, which makes any place look like any other, and has a rival that most of
     the source lies on as well."""

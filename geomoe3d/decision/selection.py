@@ -18,10 +18,18 @@ from geomoe3d.clouds.pair import Pair
 from geomoe3d.config import DecisionConfig, RegistrationConfig, expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.choosers import Choosers
-from geomoe3d.decision.confidence import Judgement, judge, lead_over
+from geomoe3d.decision.confidence import (
+    Judgement,
+    confidence_score,
+    is_likely,
+    judge,
+    lead_over,
+    repeated,
+)
 from geomoe3d.decision.distinct import are_different, distinct
 from geomoe3d.decision.information import measure_information
 from geomoe3d.decision.parallel import Parallel
+from geomoe3d.decision.twins import elsewhere, looks_around
 from geomoe3d.geometry.se3 import check_motion, motions_apart, residuals, shift_frames
 from geomoe3d.refinement.base import PairRefiner
 from geomoe3d.runtime.threads import each
@@ -163,6 +171,10 @@ class Selection:
         )
         support, count = self._support(answer), len(self._pair.matched)
         judgement = judge(answer, rival, lead, support, information, limits, count, margin)
+        twin = self._twin(answer) if is_likely(judgement) else None
+        if twin is not None:
+            rival, lead = twin, lead_over(evidence_of(answer).surface_score, evidence_of(twin).surface_score)
+            judgement = repeated(judgement, lead)
         if judgement.status == "ok" and answer.note is not None and self._pair.matched.viewpoints is None:
             # Scans of two places that were ok had not been refined either.
             most = expert().selection.most_unrefined
@@ -318,6 +330,26 @@ class Selection:
             if best is None or other.score > best.score:
                 best = other
         return best, lead_over(answer.score, None if best is None else best.score)
+
+    def _twin(self, answer: Hypothesis) -> Hypothesis | None:
+        """The clearly different transform that the clouds would believe if the answer were not there, if any; sought
+        for scans that look all around alone."""
+        if self._parallel is None or not all(map(looks_around, self._pair.clouds)):
+            return None
+        known, score = expert().twins, evidence_of(answer).surface_score
+        places = [Hypothesis(T) for T in elsewhere(answer.T_target_source, self._parallel.shared)]
+        self._ask(SURFACES, places)
+        liked = sorted([*self.hypotheses, *places], key=lambda h: -evidence_of(h).surface_score)
+        liked = [h for h in liked if evidence_of(h).surface_score >= known.least_proposed * score]
+        different = (h for h in liked if self._differ(answer, h))
+        for twin in self._refine_all(distinct(different, self._source, self._shift, known.most_refined)):
+            evidence, T = evidence_of(twin), twin.T_target_source
+            if evidence.surface_score >= known.least_score * score and self._are_apart(answer, twin):
+                information = measure_information(T, *self._pair.clouds, self._pair.inlier_threshold)
+                lead = expert().confidence.unrivalled_lead
+                if confidence_score(evidence, lead, self._support(twin), information) >= known.believed:
+                    return twin
+        return None
 
     def _differ(self, one: Hypothesis, other: Hypothesis) -> bool:
         return are_different(one.T_target_source, other.T_target_source, self._source, self._shift)

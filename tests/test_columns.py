@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomoe3d.geometry.columns import bounds, crossed, extents, finite_rows
+from geomoe3d.geometry.columns import bounds, crossed, exponential, extents, finite_rows
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -26,3 +26,11 @@ def test_rows_with_anything_that_is_no_number_are_not_finite() -> None:
     assert finite_rows(points).tolist() == [True, False, False, True, False, True]
     assert np.array_equal(points, before, equal_nan=True)
     assert finite_rows(np.zeros((0, 3))).shape == (0,)
+
+
+def test_an_exponential_keeps_no_number_that_slows_the_processor_and_no_sum_changes() -> None:
+    x = np.linspace(0, -200, 2001, dtype=np.float32)
+    plain, found = np.exp(x), exponential(x.copy())
+    assert np.array_equal(found[x >= -80], plain[x >= -80])
+    assert found.min() >= np.finfo(np.float32).tiny
+    assert found.max() == 1 and np.array_equal(np.cumsum(found), np.cumsum(plain))

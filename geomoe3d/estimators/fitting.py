@@ -10,6 +10,7 @@ import numpy as np
 
 from geomoe3d.config import expert
 from geomoe3d.estimators.surroundings import Surroundings
+from geomoe3d.geometry.columns import exponential
 from geomoe3d.geometry.rigid_fit import fit_rigid_shared, spread_shared, squared_residuals_shared
 from geomoe3d.geometry.se3 import make_transform
 from geomoe3d.types import Float32Array, FloatArray, Hypothesis
@@ -35,7 +36,7 @@ def score(
         part = slice(start, start + step)
         kernel = squared_residuals_shared(R[part], t[part], known).astype(np.float32)
         kernel *= np.float32(-0.5 / expert().consensus.score_sigma ** 2)
-        np.exp(kernel, out=kernel)
+        exponential(kernel)
         if surroundings is not None:
             kernel *= surroundings.matched(R[part])
         scores[part] = kernel @ vote

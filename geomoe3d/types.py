@@ -99,6 +99,12 @@ class PreparedCloud:
 
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
+    @cached_property
+    def center(self) -> FloatArray:
+        """(3,) mean of the points: where shifts of transforms are measured, some hundred times for a doubtful pair."""
+        middle: FloatArray = self.points.mean(0)
+        return middle
+
 
 @dataclass(frozen=True)
 class Correspondences:

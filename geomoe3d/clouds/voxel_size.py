@@ -64,6 +64,8 @@ def bounded_voxel_size(source: PointCloud, target: PointCloud, voxel_size: float
     """The given size, or the next larger at which neither cloud occupies more than ``max_points`` voxels.
     Raises InputError: a voxel so small that the grid's indices overflow."""
     for cloud in (source,) if source is target else (source, target):
+        if len(cloud) <= max_points:  # no point is in two voxels
+            continue
         while (occupied := num_different(voxel_keys(cloud.points, voxel_size, OFF_ROUND))) > max_points:
             # Surfaces fill voxels like 1 / size^2; a little more than that ends the search soon.
             voxel_size *= expert().preparation.coarsening * float(np.sqrt(occupied / max_points))

@@ -267,7 +267,7 @@ def _alternative(decision: Decision, source: PreparedCloud, target: PreparedClou
     if decision.alternative is None:
         return None
     T = decision.alternative.T_target_source
-    shift, turn = motions_apart(decision.T_target_source, T, source.points.mean(0))
+    shift, turn = motions_apart(decision.T_target_source, T, source.center)
     return Alternative(
         T_target_source=shift_frames(T, source.origin, target.origin),
         relative_score=1 / decision.lead if decision.lead > 0 else 1.0,

@@ -14,7 +14,7 @@ def distinct(
     ranked: Iterable[Hypothesis], source: PreparedCloud, max_shift: float, limit: int
 ) -> list[Hypothesis]:
     """The best hypotheses that are all different transforms, at most ``limit``; see `are_different`."""
-    given, center = list(ranked), source.points.mean(0)
+    given, center = list(ranked), source.center
     transforms = np.array([h.T_target_source for h in given]).reshape(-1, 4, 4)
     left, chosen = np.ones(len(given), dtype=np.bool_), list[Hypothesis]()
     while left.any() and len(chosen) < limit:
@@ -33,7 +33,7 @@ def are_different(T_a: FloatArray, T_b: FloatArray, source: PreparedCloud, max_s
         source: its centroid is where shifts are measured.
         max_shift: transforms closer than this, cloud units, and closer than 15 degrees are the same.
     """
-    return bool(_differing(T_a, T_b[None], source.points.mean(0), max_shift)[0])
+    return bool(_differing(T_a, T_b[None], source.center, max_shift)[0])
 
 
 def _differing(T: FloatArray, others: FloatArray, center: FloatArray, max_shift: float) -> BoolArray:

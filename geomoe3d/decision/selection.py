@@ -367,7 +367,7 @@ class Selection:
         T, guess = answer.T_target_source, self._guess
         if not are_different(T, guess, self._source, self._shift):
             return None
-        shift, turn = motions_apart(T, guess, self._source.points.mean(0))
+        shift, turn = motions_apart(T, guess, self._source.center)
         return f"the first guess is not the answer: refined, it lies {turn:.1f} deg and {shift:.3g} away"
 
     def _support(self, answer: Hypothesis) -> float:

@@ -50,7 +50,7 @@ class FpfhDescriptor(Descriptor):
 
         # The tensor API gives the legacy one's features in two thirds of its time. It works in single precision,
         # hence centred and in voxels.
-        places = (cloud.points - cloud.points.mean(0)) / cloud.voxel_size
+        places = (cloud.points - cloud.center) / cloud.voxel_size
         tensor = o3d.core.Tensor.from_numpy
         geometry: Any = o3d.t.geometry.PointCloud(tensor(places.astype(np.float32)))
         geometry.point.normals = tensor(cloud.normals.astype(np.float32))

@@ -55,7 +55,7 @@ def pyramid(cloud: PreparedCloud, fpfh: Float32Array | None = None) -> tuple[Lev
 
     ``fpfh``: (n, 33) features of `FpfhDescriptor()` where somebody has them, which is most of the work.
     """
-    places = ((cloud.points - cloud.points.mean(0)) / cloud.voxel_size).astype(np.float32)
+    places = ((cloud.points - cloud.center) / cloud.voxel_size).astype(np.float32)
     normals = cloud.normals.astype(np.float32)
     levels = []
     for edge in FACTORS:

@@ -58,7 +58,7 @@ class CloudAligner:
 
     def __init__(self, source: PreparedCloud, target: PreparedCloud, config: RefinementConfig) -> None:
         self._config, self._voxel = config, source.voxel_size
-        self._centre = source.points.mean(0) / source.voxel_size
+        self._centre = source.center / source.voxel_size
         self._source, self._target_cloud = source.points / source.voxel_size, target
         ranks = cell_ranks(source.points, source.voxel_size, 0)
         self._all = np.arange(len(source))

@@ -3,13 +3,15 @@
     python scripts/measure_time.py --every 24 [--first 12] [--beside CHECKOUT]
     python scripts/measure_time.py SOURCE TARGET [--repeats 5]
     python scripts/measure_time.py --million 5 [--beside CHECKOUT] [--repeats 3]
+    python scripts/measure_time.py --world FOLDER [--repeats 3]
 
 The first runs every 24th pair of 3DMatch and 3DLoMatch end to end beside KISS-Matcher, and on 1,000 correspondences
 beside Open3D's RANSAC, each in a warm process of its own and in turn pair by pair, so that a busy machine slows all
 alike: the ratios count, not the milliseconds. The second is the command ``register`` beside a script that reads the
 same files with Open3D and calls KISS-Matcher with voxels of 5 cm, with the imports that cost most; the third two
-generated clouds of so many points. Processor time, user and system together, says more than the clock where other
-jobs run.
+generated clouds of so many points; the fourth every pair ``*_s.ply``, ``*_t.ply`` of a folder beside KISS-Matcher with
+voxels half as wide as ours, both in this process, in turn, from arrays. Processor time, user and system together, says
+more than the clock where other jobs run.
 """
 
 from __future__ import annotations
@@ -22,12 +24,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 import numpy as np
 
+from geomoe3d import Registrar, load_points
 from geomoe3d.clouds.io import save_points
 from geomoe3d.data.sample import make_sample_pair
 
@@ -69,8 +73,17 @@ class Run(NamedTuple):
     "--beside", type=click.Path(exists=True, file_okay=False), help="Another checkout, run in turn."
 )
 @click.option("--million", default=0.0, help="Points of two large clouds, in millions. [none]")
+@click.option(
+    "--world", "folder", type=click.Path(exists=True, file_okay=False), help="Folder of pairs. [none]"
+)
 def main(
-    clouds: tuple[str, ...], repeats: int, every: int, first: int, beside: str | None, million: float
+    clouds: tuple[str, ...],
+    repeats: int,
+    every: int,
+    first: int,
+    beside: str | None,
+    million: float,
+    folder: str | None,
 ) -> None:
     """Print what was asked for; see the top of the file."""
     print(f"{os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f}")
@@ -86,6 +99,8 @@ def main(
                 compare(f"{benchmark}, {track}, {name}", workers, benchmark, range(first, count, every))
     if million:
         large(million, beside, repeats)
+    if folder is not None:
+        world(Path(folder), repeats)
 
 
 def shell(source: str, target: str, repeats: int) -> None:
@@ -114,6 +129,41 @@ def large(million: float, beside: str | None, repeats: int) -> None:
                 if name == "geomoe3d" or checkout is not None:
                     runs.setdefault(name, []).append(measure([*command, *names], checkout))
     _table({name: _middle(some) for name, some in runs.items()}, f"two of {million:g} million points")
+
+
+def world(folder: Path, repeats: int) -> None:
+    """A row per pair: seconds by the clock and of the processor, medians, beside KISS-Matcher's at half our voxel."""
+    import kiss_matcher
+
+    registrar, ratios = Registrar(), []
+    print(f"\n{'pair':24} {'voxel':>7} {'geomoe3d':>14} {'KISS-Matcher':>14} {'ratio':>12}  status")
+    for source in sorted(folder.glob("*_s.ply")):
+        target = source.with_name(source.name.replace("_s.ply", "_t.ply"))
+        if not target.exists():
+            continue
+        loaded = [load_points(path) for path in (source, target)]
+        given, near_zero = [cloud.file_points for cloud in loaded], [cloud.points for cloud in loaded]
+        answer = registrar.register(*given)
+        config = kiss_matcher.KISSMatcherConfig(answer.voxel_size / 2)
+        taken = []
+        for _ in range(repeats):
+            ours = _timed(registrar.register, *given)
+            taken.append([*ours, *_timed(kiss_matcher.KISSMatcher(config).estimate, *near_zero)])
+        wall, cpu, their_wall, their_cpu = (float(x) for x in np.median(taken, axis=0))
+        ratios.append((wall / their_wall, cpu / their_cpu))
+        print(
+            f"{source.name[:-6]:24} {answer.voxel_size:7.3g} {wall:7.2f} {cpu:6.2f} {their_wall:7.2f} {their_cpu:6.2f} "
+            f"{ratios[-1][0]:6.2f} {ratios[-1][1]:5.2f}  {answer.status}",
+            flush=True,
+        )
+    clock, processor = np.median(ratios, axis=0)
+    print(f"{'median of the ratios':63} {clock:6.2f} {processor:5.2f}")
+
+
+def _timed(call: Callable[..., object], *given: object) -> tuple[float, float]:
+    wall, cpu = time.perf_counter(), time.process_time()
+    call(*given)
+    return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def _middle(runs: list[Run]) -> Run:

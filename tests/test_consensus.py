@@ -138,7 +138,9 @@ def test_default_bound_of_all_pairs() -> None:
 def test_distances_and_compatibility_equal_their_definitions() -> None:
     rng = np.random.default_rng(80)
     p, q = rng.normal(size=(2, 60, 3)).astype(np.float32) * 20
-    np.testing.assert_allclose(compatibility.distances(p, p), cdist(p, p), atol=0.05)
+    np.testing.assert_allclose(
+        compatibility.distances(*compatibility.distance_factors(p)), cdist(p, p), atol=0.05
+    )
     q[:30] = p[:30]
     expected = np.abs(cdist(p, p) - cdist(q, q))
     close, compatible = compatibility.compatibility(p / 20, q / 20, 1 / 20)

@@ -19,16 +19,25 @@ PAIR_BLOCK = 125  # the same where several such blocks are worked on
 
 def bundle_weights(target: FloatArray) -> Float32Array:
     """1 / sqrt(number of correspondences that share the target point), (N,) float32."""
-    _, inverse, counts = np.unique(target, axis=0, return_inverse=True, return_counts=True)
-    weights: Float32Array = (1.0 / np.sqrt(counts[inverse.ravel()])).astype(np.float32)
+    order = np.lexsort(target.T)
+    ordered = target[order]
+    group = np.cumsum((ordered[1:] != ordered[:-1]).any(1))
+    group = np.concatenate([np.zeros(min(len(target), 1), dtype=group.dtype), group])
+    weights: Float32Array = np.empty(len(target), dtype=np.float32)
+    weights[order] = 1.0 / np.sqrt(np.bincount(group)[group])
     return weights
 
 
-def distances(a: Float32Array, b: Float32Array) -> Float32Array:
-    """(N, M) Euclidean distances of points (N, 3) and (M, 3), near zero, through one matrix product."""
-    a2, b2 = (a * a).sum(1, keepdims=True), (b * b).sum(1, keepdims=True)
-    # [-2a, |a|^2, 1] . [b, 1, |b|^2] = |a - b|^2 without a further pass over N x M numbers.
-    left, right = np.hstack([-2 * a, a2, np.ones_like(a2)]), np.hstack([b, np.ones_like(b2), b2])
+def distance_factors(points: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Left and right (N, 5) of points (N, 3), whose product with those of others is the square of the distance:
+    [-2a, |a|^2, 1] . [b, 1, |b|^2] = |a - b|^2, without a further pass over all pairs."""
+    squares = (points * points).sum(1, keepdims=True)
+    ones = np.ones_like(squares)
+    return np.hstack([-2 * points, squares, ones]), np.hstack([points, ones, squares])
+
+
+def distances(left: Float32Array, right: Float32Array) -> Float32Array:
+    """(N, M) Euclidean distances, by the left and right of `distance_factors`, of points near zero."""
     found: Float32Array = left @ right.T
     np.maximum(found, 0, out=found)
     np.sqrt(found, out=found)
@@ -51,12 +60,12 @@ def compatibility(
     compatible = np.empty(close.shape, dtype=np.float32)
 
     agree = None if surroundings is None else surroundings.of_pairs(source, target)
+    (p, p_rest), (q, q_rest) = distance_factors(source), distance_factors(target)
 
     def fill(some: IntArray) -> None:
         # Both are symmetric: from the diagonal on, and the same below it.
         rows, rest = slice(some[0], some[-1] + 1), slice(some[0], None)
-        near = distances(source[rows], source[rest])
-        gap = distances(target[rows], target[rest])
+        near, gap = distances(p[rows], p_rest[rest]), distances(q[rows], q_rest[rest])
         gap -= near
         found = np.less(np.abs(gap, out=gap), tolerance, out=gap, casting="unsafe")
         within = near < 1.0

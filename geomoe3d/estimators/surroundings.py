@@ -109,18 +109,24 @@ class Surroundings:
             for n, x in zip(self.normals, (source, target), strict=True)
         ]
         known = expert().surroundings
+        # Source and negated target side by side: one product gives the difference.
+        (places_left, places_right), (planes_left, planes_right), (left, right) = (
+            (np.hstack([one, -other]), np.hstack([one, other]))
+            for one, other in (places, planes, self.normals)
+        )
 
         def agreement(rows: slice, apart: Float32Array) -> Float32Array:
-            error = self._difference(planes, places, rows)  # height of each point over the plane of a row
+            # Heights of each point over the plane of a row.
+            error = self._difference(planes_left, places_right, rows)
             error *= error
-            other = self._difference(places, planes, rows)
+            other = self._difference(places_left, planes_right, rows)
             other *= other
             error += other
             np.maximum(apart, 1.0, out=other)
             other *= other
             other *= np.float32(-2 * known.plane_sigma**2)
             error /= other
-            turn = self._difference(self.normals, self.normals, rows)
+            turn = self._difference(left, right, rows)
             turn *= turn
             turn *= np.float32(-0.5 / known.turn_sigma**2)
             error += turn
@@ -131,17 +137,16 @@ class Surroundings:
 
         return agreement
 
-    def _difference(self, left: Any, right: Any, rows: slice) -> Float32Array:
-        """left right^T of the source minus that of the target, from the first row on; of magnitudes where signs mean
-        nothing."""
-        found: Float32Array
+    def _difference(self, left: Float32Array, right: Float32Array, rows: slice) -> Float32Array:
+        """left right^T of some rows and all from the first of them on, (N, 2k) of source and target side by side; where
+        signs mean nothing that of the magnitudes of both products."""
         rest = slice(rows.start, None)
         if self.signed:
-            both = np.hstack([left[0][rows], -left[1][rows]])
-            found = both @ np.hstack([right[0][rest], right[1][rest]]).T
+            found: Float32Array = left[rows] @ right[rest].T
             return found
-        found = np.abs(left[0][rows] @ right[0][rest].T)
-        found -= np.abs(left[1][rows] @ right[1][rest].T)
+        half = left.shape[1] // 2
+        found = np.abs(left[rows, :half] @ right[rest, :half].T)
+        found -= np.abs(left[rows, half:] @ right[rest, half:].T)
         return found
 
     def matched(self, R: NDArray[Any]) -> Float32Array:

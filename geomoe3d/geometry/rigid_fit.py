@@ -80,21 +80,30 @@ def squared_residuals_shared(R: Floats, t: Floats, rows: FloatArray) -> FloatArr
 
     Of points within 1e4 of their centroid they err by some 1e-8.
     """
-    turned = 2 * np.einsum("kij,ki->kj", R, t)
-    squares = np.einsum("ki,ki->k", t, t)[:, None]
-    of_products = -2 * R.transpose(0, 2, 1).reshape(-1, 9)
-    found: FloatArray = np.hstack([of_products, turned, -2 * t, np.ones_like(squares), squares]) @ rows.T
+    factors = np.empty((len(R), rows.shape[1]))
+    np.multiply(R.transpose(0, 2, 1).reshape(-1, 9), -2, out=factors[:, :9])
+    np.multiply(np.einsum("kij,ki->kj", R, t), 2, out=factors[:, 9:12])
+    np.multiply(t, -2, out=factors[:, 12:15])
+    factors[:, 15], factors[:, 16] = 1, np.einsum("ki,ki->k", t, t)
+    found: FloatArray = factors @ rows.T
     return np.maximum(found, 0, out=found)
 
 
 def _motion(H: Floats, source_mean: Floats, target_mean: Floats) -> tuple[Floats, Floats]:
     U, _, Vt = np.linalg.svd(H.astype(np.float64))
-    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    sign = np.sign(_determinants(U) * _determinants(Vt))
     V = np.swapaxes(Vt, -1, -2).copy()
     V[..., :, 2] *= sign[..., None]
     R = (V @ np.swapaxes(U, -1, -2)).astype(H.dtype)
     t = target_mean - np.einsum("...ij,...j->...i", R, source_mean)
     return R, t
+
+
+def _determinants(matrices: FloatArray) -> FloatArray:
+    """(...) of (..., 3, 3) orthogonal matrices: 1 or -1 but for rounding; by numpy's it takes seven times as long."""
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrices, (-2, -1), (0, 1))
+    found: FloatArray = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    return found
 
 
 def squared_residuals(R: Floats, t: Floats, source: Floats, target: Floats) -> Floats:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.evidence import Met, kernel
 from geomoe3d.clouds.keypoints import KeypointSurfaces, Surface
-from geomoe3d.estimators.compatibility import bundle_weights, distances
+from geomoe3d.estimators.compatibility import bundle_weights, distance_factors, distances
 from geomoe3d.geometry.draws import drawn_rows
 from geomoe3d.runtime.threads import each
 from geomoe3d.types import Float32Array, FloatArray
@@ -132,13 +132,16 @@ def _degree_jobs(rows: FloatArray) -> list[Callable[[], Float32Array]]:
     chosen = drawn_rows(rows, 1.0, 1000)
     anchors, is_anchor = unit[chosen], np.isin(np.arange(len(unit)), chosen)
 
+    (p, q), (p_anchors, q_anchors) = (
+        [distance_factors(side)[k] for side in np.hsplit(some, 2)] for k, some in enumerate((unit, anchors))
+    )
     at_once = 125  # rows
 
     def part(start: int) -> Float32Array:
-        some = unit[start : start + at_once]
-        itself = is_anchor[start : start + len(some)]  # only an anchor meets itself
-        gap = distances(some[:, :3], anchors[:, :3])
-        gap -= distances(some[:, 3:], anchors[:, 3:])
+        some = slice(start, start + at_once)
+        itself = is_anchor[some]  # only an anchor meets itself
+        gap = distances(p[some], p_anchors)
+        gap -= distances(q[some], q_anchors)
         compatible = np.abs(gap, out=gap) < 1.0
         share: Float32Array = (5 * (compatible.sum(1) - itself) / len(anchors)).astype(np.float32)
         return share

@@ -67,9 +67,9 @@ def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
         _order=np.arange(200),
         _view=object(),
     )
-    assert Search._quick(search, np.eye(4)) == 0.0
+    assert Search.quick(search, np.eye(4)) == 0.0
     search._view = None
-    assert Search._quick(search, np.eye(4)) == 1.0
+    assert Search.quick(search, np.eye(4)) == 1.0
 
 
 def test_where_a_sensor_of_the_map_saw_through_no_surface_stands():

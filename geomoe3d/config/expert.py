@@ -27,7 +27,7 @@ from geomoe3d.config.expert_decision import (
     SimilarityExpert,
     TwinsExpert,
 )
-from geomoe3d.config.expert_maps import LocatingExpert, MapsExpert, PlacesExpert
+from geomoe3d.config.expert_maps import DetailExpert, LocatingExpert, MapsExpert, PlacesExpert
 from geomoe3d.config.expert_multiway import ManyGroupsExpert, ManyPairsExpert, ManyPosesExpert
 from geomoe3d.config.expert_proposing import (
     ConsensusExpert,
@@ -78,6 +78,7 @@ class ExpertConfig(Section):
     maps: MapsExpert = MapsExpert()
     places: PlacesExpert = PlacesExpert()
     locating: LocatingExpert = LocatingExpert()
+    detail: DetailExpert = DetailExpert()
     loading: LoadingExpert = LoadingExpert()
     preparation: PreparationExpert = PreparationExpert()
     viewpoint: ViewpointExpert = ViewpointExpert()

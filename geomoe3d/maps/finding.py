@@ -16,10 +16,11 @@ import numpy as np
 from geomoe3d.clouds.prepare import prepare
 from geomoe3d.clouds.viewpoint import find_viewpoints, seen_by_none
 from geomoe3d.clouds.voxel_size import bounded_voxel_size, voxel_sizes_of
-from geomoe3d.config import expert
+from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.se3 import motions_apart, shift_frames, transform_points
+from geomoe3d.maps.detail import Detail, Fitting
 from geomoe3d.maps.level import Level, described
 from geomoe3d.maps.locate import Found, Search, likely
 from geomoe3d.maps.voxels import VoxelSums
@@ -28,7 +29,12 @@ from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 Look = Literal["quick", "more", "other", "finer"]
-"""At the likeliest windows; at more, with more matches; that on another grid; where it was found, on the scan's."""
+"""At the likeliest windows; at more, with more matches; that on another grid; on the scan's, where it was found and
+where it fits best in detail."""
+
+FITS_BETTER = (
+    "in detail the scan fits better at another place of the map, which was not found to be its place either"
+)
 
 
 @dataclass(frozen=True)
@@ -74,18 +80,24 @@ class Finder:
         own, coarsest = self._grids(cloud)
         whole = self._begun(cloud, view, self.level_for(own, coarsest, expert().maps.asked_points), clock)
         search, twinned = whole, False
+        detail: Detail | None = None
+        fitting: Fitting = []
         known: list[FloatArray] = []
         times = max(1.0, count / expert().maps.candidates)
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
-            # Once places that are alike are known, only a finer grid may tell them apart.
-            if twinned and look in ("more", "other"):
+            # Once places that are alike are known, or what fits in detail, only a finer grid may tell them apart.
+            if (twinned or detail is not None) and look in ("more", "other"):
                 continue
             if look == "other":
                 level = self._other(search, cloud, own)
             elif look == "finer":
                 known = [*known, *(T for first in known[:1] for T in whole.twins(first, count))]
+                if detail is None and not twinned:
+                    detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
+                if fitting:  # what else was looked at fits worse, and the more places, the coarser the grid
+                    known = [T for score, T in fitting if score >= expert().detail.close * fitting[0][0]]
                 if best is not None and best.decision.answer is not None:
                     known.append(best.decision.T_target_source)
                 level = self._around(search, known, own)
@@ -97,7 +109,9 @@ class Finder:
                 search = self._begun(cloud, view, level, clock, whole.level if look == "finer" else None)
             more = look != "quick"
             candidates = search.candidates(more=more, near=where, given=[*local, *known], times=times)
-            known = [h.T_target_source for h in likely(candidates, count)]
+            asked, known = known, [h.T_target_source for h in likely(candidates, count)]
+            if look == "finer":
+                known += [T for T in asked if all(search.differ(Hypothesis(T), Hypothesis(x)) for x in known)]
             found = [search.look(Hypothesis(T), fully=more) for T in known]
             if not found:
                 continue
@@ -115,8 +129,16 @@ class Finder:
             # The last look has seen the answers before it, and more of the scan than they did.
             if best is None or latest.sure or look == "finer" or latest.confidence > best.confidence:
                 best, ranked = latest, others
-            if latest.sure:
+            if not latest.sure:
+                continue
+            beyond_doubt = latest.confidence >= expert().locating.checked_below or where is not None
+            if beyond_doubt or search.query.num_windows < expert().detail.many_places:
                 break
+            if detail is None:
+                detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
+            if detail is None or not detail.fits_better(search, latest.decision.T_target_source, fitting):
+                break
+            best = replace(latest, decision=latest.decision.doubted(FITS_BETTER))
         if best is None or best.decision.answer is None:
             return None, []
         decision = best.decision
@@ -163,10 +185,8 @@ class Finder:
     ) -> Search:
         """The search for a scan on a level; ``sight`` as of `Search`."""
         clock("preprocess")
-        config = self.line.config.preparation
-        if seen_by_none((cloud, cloud)):
-            config = config.model_copy(update={"viewpoint": "centroid"})
-        bare = prepare(cloud, level.voxel_size, config, viewpoint=view, seed=self.line.config.seed)
+        config, seed = self._prepared_as(cloud), self.line.config.seed
+        bare = prepare(cloud, level.voxel_size, config, viewpoint=view, seed=seed)
         clock("features")
         scan, compared = described(bare, self.line.descriptor)
         return Search(self.line, scan, compared, level, self._part(level), clock, sight)
@@ -202,6 +222,28 @@ class Finder:
             return Level.of(around, size, self.line.config.preparation)
         except EmptyCloudError:
             return None
+
+    def _in_detail(
+        self,
+        cloud: PointCloud,
+        view: FloatArray | None,
+        search: Search,
+        own: float,
+        count: int,
+        clock: StageClock,
+    ) -> tuple[Detail | None, Fitting]:
+        """The scan in detail, and where in the map it fits best; None where that is no finer than the search's grid."""
+        size = max(own, expert().detail.finest * self.voxels.edge)
+        if search.level.voxel_size <= expert().maps.finer * size:
+            return None, []
+        clock("detail")
+        fine = prepare(cloud, size, self._prepared_as(cloud), viewpoint=view, seed=self.line.config.seed)
+        detail = Detail.of(fine, self.voxels, search, self.line.config.seed)
+        return detail, detail.widely(search, count)
+
+    def _prepared_as(self, cloud: PointCloud) -> PreparationConfig:
+        config = self.line.config.preparation
+        return config.model_copy(update={"viewpoint": "centroid"}) if seen_by_none((cloud, cloud)) else config
 
     def _looks(
         self, near: tuple[FloatArray, float] | None

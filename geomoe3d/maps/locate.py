@@ -103,7 +103,7 @@ class Search:
         margin = expert().locating.margin * scan.voxel_size
         self._box = scan.points.min(0) - margin, scan.points.max(0) + margin
         clock("places")
-        self._query = Query(compared, level, seed=self.config.seed)
+        self.query = Query(compared, level, seed=self.config.seed)
         rng = np.random.default_rng(self.config.seed)
         self._rows = np.sort(rng.permutation(len(scan))[: expert().locating.asked])
         self._order = rng.permutation(len(level.points))
@@ -130,7 +130,7 @@ class Search:
         within = None if near is None else (near[0], near[1] + float(np.linalg.norm(self.eye - self.center)))
         known = expert().locating
         most = known.more_windows if more else known.windows
-        windows = self._query.windows(math.ceil(times * most), within)
+        windows = self.query.windows(math.ceil(times * most), within)
         self._clock("propose")
         scored = self._proposed(windows, near, given, times, more)
         scored.sort(key=lambda item: -item[0])
@@ -147,8 +147,8 @@ class Search:
         ]
 
         def closer(T: FloatArray) -> tuple[float, Hypothesis]:
-            T = self._polished(T)
-            return self._quick(T), Hypothesis(T)
+            T = self.polished(T)
+            return self.quick(T), Hypothesis(T)
 
         both = [*chosen, *each(closer, worth)]
         best: list[tuple[float, Hypothesis]] = []
@@ -173,20 +173,20 @@ class Search:
             return []
         part = Compared(points[near], level.normals[level.rows[near]], level.features[near])
         voters = part.features[:: math.ceil(len(near) / known.twin_voters)]
-        windows = self._query.windows(4 * count, voters=voters)
+        windows = self.query.windows(4 * count, voters=voters)
         drawn = np.random.default_rng(self.config.seed).permutation(len(near))[: known.twin_asked]
         query = Query(part.take(np.sort(drawn)), level, seed=self.config.seed)
-        own, place = self._quick(T), Hypothesis(T)
+        own, place = self.quick(T), Hypothesis(T)
         least, worth = known.close * own, known.worth_polishing * own
 
         def sought(window: Window) -> tuple[float, Hypothesis] | None:
             moved = [Hypothesis(h.T_target_source @ T) for h in query.motions(window, 3, mutual=True)]
             # Windows that reach the place hold its own points, too.
             moved = [h for h in moved if self.differ(place, h)]
-            if not moved or self._quick(moved[0].T_target_source, worth) <= worth:
+            if not moved or self.quick(moved[0].T_target_source, worth) <= worth:
                 return None
-            twin = self._polished(moved[0].T_target_source)
-            score = self._quick(twin, least)
+            twin = self.polished(moved[0].T_target_source)
+            score = self.quick(twin, least)
             return (score, Hypothesis(twin)) if score > least else None
 
         likest = each(sought, _likest(windows, center, self.reach))
@@ -210,23 +210,23 @@ class Search:
         Once one fits plainly, of the other windows only those are looked into that may hold another such place.
         """
         known = expert().locating
-        scored = [(self._quick(T), Hypothesis(T)) for T in given]
+        scored = [(self.quick(T), Hypothesis(T)) for T in given]
         # What was known before did not convince, or it would not be asked again.
         plain = max([known.plain, *(known.better * score for score, _ in scored)]) if more else known.plain
         found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
-        motions = ahead(lambda w: self._query.motions(w, known.per_window[more], more=more), windows)
+        motions = ahead(lambda w: self.query.motions(w, known.per_window[more], more=more), windows)
         for number, window in enumerate(windows):
             if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
                 break
             if found is not None and window.votes < known.rival_votes * found[0]:
                 break
-            if found is not None and np.linalg.norm(window.center - found[1]) < self._query.radius:
+            if found is not None and np.linalg.norm(window.center - found[1]) < self.query.radius:
                 continue
             proposed = motions(number)
             if near is not None:
                 proposed = [h for h in proposed if self.is_near(h.T_target_source, near)]
             least = known.worth_polishing * max((q for q, _ in scored), default=0.0)
-            fresh = [(self._quick(h.T_target_source, least), h) for h in proposed]
+            fresh = [(self.quick(h.T_target_source, least), h) for h in proposed]
             scored += fresh
             best = max(fresh, key=_score, default=None)
             if found is None and times == 1.0 and best is not None and best[0] > max(plain, known.plainest):
@@ -309,7 +309,7 @@ class Search:
         """Whether a transform (4, 4) puts the scan's sensor where it is said to be; ``near`` as of `candidates`."""
         return float(np.linalg.norm(transform_points(T, self.eye[None])[0] - near[0])) <= near[1]
 
-    def _polished(self, T: FloatArray) -> FloatArray:
+    def polished(self, T: FloatArray) -> FloatArray:
         """A motion drawn closer by a few steps of point-to-plane alignment on the points of the quick look."""
         from scipy.spatial.transform import Rotation
 
@@ -333,7 +333,7 @@ class Search:
             T = make_transform(turn, center + step[3:] - turn @ center) @ T
         return T
 
-    def _quick(self, T: FloatArray, least: float = 0.0) -> float:
+    def quick(self, T: FloatArray, least: float = 0.0) -> float:
         """Share of the scan's points that lie on the map with an agreeing plane, times exp(-10 v), v the share of map
         points that stand where the scan's sensor looked through, and the same of the scan and the map's sensors; that
         is not asked where the first is below ``least``.

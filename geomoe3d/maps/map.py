@@ -56,6 +56,7 @@ class Map:
         line: Pipeline | None = None,
     ) -> None:
         self._voxels, self._levels = voxels, levels
+        self._larger: tuple[Level, ...] = ()  # never asked first, so that no answer hangs on earlier scans
         self.sources, self.name = sources, name
         self.config = resolved(config)
         self._line = line
@@ -216,7 +217,7 @@ class Map:
     @property
     def voxel_sizes(self) -> tuple[float, ...]:
         """Grids on which the map is described, cloud units; scans that want another one get it once."""
-        return tuple(level.voxel_size for level in self._levels)
+        return tuple(sorted(level.voxel_size for level in (*self._levels, *self._larger)))
 
     @expert_in_force
     def locate(
@@ -309,18 +310,22 @@ class Map:
 
         What is made for a scan is no finer than a stated number of points allows, unless the grid is given.
         """
-        finer = expert().maps.finer
-        fitting = [x for x in self._levels if size / finer <= x.voxel_size <= coarsest]
+        finer, last = expert().maps.finer, most > expert().maps.asked_points
+        known = (*self._levels, *self._larger) if last else self._levels
+        fitting = [x for x in known if size / finer <= x.voxel_size <= coarsest]
         if not fitting and self.config.voxel_size is None:
             size = max(size, self._voxels.edge_for(most))
-            fitting = [x for x in self._levels if size / finer <= x.voxel_size <= finer * size]
+            fitting = [x for x in known if size / finer <= x.voxel_size <= finer * size]
         if not fitting:
-            return self._described(size)
+            return self._described(size, last)
         return min(fitting, key=lambda level: abs(math.log(level.voxel_size / size)))
 
-    def _described(self, size: float) -> Level:
-        """A new level."""
+    def _described(self, size: float, last: bool = False) -> Level:
+        """A new level; ``last``: only for what is asked in the end."""
         made = Level.of(self._voxels, max(size, self._voxels.edge), self.config.preparation, self.name)
+        if last:
+            self._larger = (*self._larger, made)
+            return made
         self._levels = tuple(sorted((*self._levels, made), key=_size))
         return made
 

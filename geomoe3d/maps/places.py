@@ -125,6 +125,11 @@ class Query:
             likely = likely[np.linalg.norm(cells.centers[likely] - center, axis=1) >= apart]
         return found
 
+    @property
+    def num_windows(self) -> int:
+        """Of the map, also those that overlap."""
+        return len(self._cells.centers)
+
     @cached_property
     def _cells(self) -> _Cells:
         from scipy.spatial import cKDTree

@@ -8,12 +8,16 @@ whole. 64 bytes per voxel; a million points take some 0.3 s.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _BITS = 21  # of a key, for each axis
 _HALF = 2 ** (_BITS - 1)
@@ -58,6 +62,13 @@ class VoxelSums:
         """(M, 3) mean points, local coordinates."""
         means: FloatArray = self.sums / self.counts[:, None]
         return means
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the mean points, which are its ``data``; made quickly, half a second for four million."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     def added(self, points: FloatArray, sensor: FloatArray | None = None) -> VoxelSums:
         """With more points.

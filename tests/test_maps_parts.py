@@ -115,6 +115,7 @@ def test_on_a_part_of_a_map_the_sensors_of_the_whole_are_asked(monkeypatch):
     monkeypatch.setattr(finding, "described", lambda *_: (None, None))
     monkeypatch.setattr(finding, "Search", search)
     monkeypatch.setattr(finding.Finder, "_around", lambda *_: part)
+    monkeypatch.setattr(finding.Finder, "_in_detail", lambda *_: (None, []))
     line = SimpleNamespace(config=RegistrationConfig(), descriptor=None)
     finder = finding.Finder(line, voxels, lambda *_: whole, "map")
     scan = PointCloud(inside, np.zeros(3))

@@ -177,9 +177,8 @@ class Query:
             normals_signed=True,
         )
         threshold = known.threshold * self.level.voxel_size
-        estimate = ConsensusEstimator(
-            num_hypotheses=count, num_seeds=known.seeds[more], num_refined=known.refined[more]
-        )
+        refined = count if mutual else known.refined[more]  # few of these are wrong
+        estimate = ConsensusEstimator(num_hypotheses=count, num_seeds=known.seeds[more], num_refined=refined)
         return estimate(
             matched.points,
             np.where(first, 1.0, 0.5),

@@ -96,8 +96,10 @@ class Finder:
                 known = [*known, *(T for first in known[:1] for T in whole.twins(first, count))]
                 if detail is None and not twinned:
                     detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
-                if fitting:  # what else was looked at fits worse, and the more places, the coarser the grid
-                    known = [T for score, T in fitting if score >= expert().detail.close * fitting[0][0]]
+                if fitting:  # few places, for a fine grid, unless more are asked for than usual
+                    best_fits = expert().detail.close * fitting[0][0]
+                    fits = [T for score, T in fitting if score >= best_fits]
+                    known = [*fits, *known] if times > 1.0 else fits
                 if best is not None and best.decision.answer is not None:
                     known.append(best.decision.T_target_source)
                 level = self._around(search, known, own)
@@ -128,7 +130,10 @@ class Finder:
             latest, others = search.decide(found)
             # The last look has seen the answers before it, and more of the scan than they did.
             if best is None or latest.sure or look == "finer" or latest.confidence > best.confidence:
-                best, ranked = latest, others
+                # Where it is not sure either, what they found follows what it found.
+                before = [] if latest.sure or look != "finer" else ranked
+                differs = [h for h in before if all(search.differ(h, other) for other in others)]
+                best, ranked = latest, [*others, *differs]
             if not latest.sure:
                 continue
             beyond_doubt = latest.confidence >= expert().locating.checked_below or where is not None

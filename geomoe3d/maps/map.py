@@ -274,7 +274,7 @@ class Map:
         result = finished_result(best.pair, decision, self.config, clock.stop())
         origins, top = (cloud.origin, self._voxels.origin), best.decision.answer.score
         places = tuple(
-            Place(shift_frames(h.T_target_source, *origins), h.score / top if top > 0 else 1.0)
+            Place(shift_frames(h.T_target_source, *origins), min(h.score / top, 1.0) if top > 0 else 1.0)
             for h in ranked[:k]
         )
         return Location(result, places)

@@ -77,7 +77,9 @@ def test_of_a_room_with_two_different_ends_it_is() -> None:
     assert found.ok and off(found.T_target_source, truth)[0] < 1
 
 
-def test_the_other_place_is_found_by_surfaces_alone() -> None:
+@pytest.mark.parametrize("far", [0.0, 3000.0])
+def test_the_other_place_is_found_by_surfaces_alone(far: float) -> None:
+    """Also where some points lie so far off that a grid of all would fit into no memory."""
     rng = np.random.default_rng(0)
     walls = rng.uniform(0, 1, (20_000, 3)) * (4.5, 6.0, 2.5)
     face = rng.integers(0, 5, len(walls))
@@ -86,6 +88,8 @@ def test_the_other_place_is_found_by_surfaces_alone() -> None:
     half_turn = turn(180, MIDDLE)
     box = rng.uniform(0, 1, (3000, 3)) * (0.8, 1.4, 1.0) + (0.6, 0.5, 0)
     points = np.vstack([walls, box, transform_points(half_turn, box)])
+    if far:
+        points = np.vstack([points, *(far * side + 0.3 * rng.normal(size=(2000, 3)) for side in np.eye(3))])
     T = make_transform(turn(25, (0, 0, 0))[:3, :3], np.array([3.0, -2.0, 1.0]))
     source, target = prepared(points), prepared(transform_points(T, points))
     local = T.copy()

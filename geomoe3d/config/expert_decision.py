@@ -62,6 +62,12 @@ class TwinsExpert(Section):
         "none of 80 fragments of depth cameras, 0.01 and more of scanners in rooms",
     )
     cell: float = constant(2.0, "voxels", (0.5, 20), "edge of the cells that are laid on each other")
+    most_cells: int = constant(
+        2**22,
+        "cells",
+        (1000, 2**30),
+        "of a grid, beyond which what lies far from the shared surface is left out",
+    )
     least_shift: float = constant(
         3.0, "cells", (0, 100), "by which a place that is not turned is another one"
     )

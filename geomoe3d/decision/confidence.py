@@ -129,8 +129,8 @@ def is_likely(judgement: Judgement) -> bool:
 def repeated(was: Judgement, lead: float) -> Judgement:
     """The judgement of an answer beside which the clouds would believe another one as well; ``lead`` by them alone."""
     twin = (
-        f"the place repeats: by the surfaces alone a clearly different transform does {100 / lead:.0f} % as well and "
-        "would be believed by itself; see the alternative"
+        f"the place repeats: by the surfaces alone a clearly different transform scores {100 / lead:.0f} % of this "
+        "one and would be believed by itself; see the alternative"
     )
     others = (reason for reason in was.reasons if reason != was.unspecific)
     return Judgement("ambiguous", (twin, *others), min(was.confidence, expert().confidence.most_doubted))

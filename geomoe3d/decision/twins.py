@@ -4,7 +4,8 @@ A scan that sees a whole room fits into it as it stands and, where the room repe
 Matches show that place badly: seen from the same side, features are more alike than the same thing's from two sides,
 so the wrong place may have nearly all of them. Surfaces know no sides: the source, turned by the right angles of
 the target's walls, is laid on the target wherever most of both coincides. Place: decide, of answers that are likely.
-About 20 ms for clouds of any size, and none for scans that look to one side.
+About 20 ms, and none for scans that look to one side. Of clouds that reach far what lies about the shared surface is
+asked alone.
 """
 
 from __future__ import annotations
@@ -44,6 +45,10 @@ def elsewhere(T_target_source: FloatArray, shared: SharedSurface) -> FloatArray:
         return np.zeros((0, 4, 4))
     known, cell = expert().twins, expert().twins.cell * target.voxel_size
     there, ours = target.points @ axes.T, transform_points(T_target_source, source.points) @ axes.T
+    shared_points = shared.contact(T_target_source, cell).points @ axes.T
+    there, ours = _around(shared_points, there, ours, cell)
+    if not min(len(there), len(ours)):
+        return np.zeros((0, 4, 4))
     found: list[tuple[float, FloatArray]] = []
     least = np.inf
     for turn in _right_turns():  # the first one turns nothing, and its best shift is the answer itself
@@ -56,6 +61,25 @@ def elsewhere(T_target_source: FloatArray, shared: SharedSurface) -> FloatArray:
                 found.append((count, moved @ T_target_source))
     found.sort(key=lambda one: -one[0])
     return np.array([T for _, T in found[: known.most_asked]]).reshape(-1, 4, 4)
+
+
+def _around(
+    shared: FloatArray, there: FloatArray, ours: FloatArray, cell: float
+) -> tuple[FloatArray, FloatArray]:
+    """Those of both clouds, (m, 3) and (n, 3), in the largest cube about the middle of what they share (k, 3) of which
+    grids are small enough: few points far away would make them larger than any memory."""
+    if not len(shared):
+        return there[:0], ours[:0]
+    middle = np.median(shared, axis=0)
+    reach = max(float(np.abs(points - middle).max()) for points in (there, ours))
+    while min(len(there), len(ours)):
+        sizes = [np.ptp(points, axis=0) / cell + 1 for points in (there, ours)]
+        grids = (np.prod(sizes[0] + np.abs(turn) @ sizes[1]) for turn in _right_turns())
+        if max(grids) <= expert().twins.most_cells:
+            break
+        reach /= 2
+        there, ours = (points[(np.abs(points - middle) <= reach).all(1)] for points in (there, ours))
+    return there, ours
 
 
 def _axes(directions: FloatArray) -> FloatArray | None:

@@ -303,6 +303,6 @@ class DetailExpert(Section):
         1000,
         "windows",
         (1, 10_000_000),
-        "of a map, from which an ok answer that is not beyond doubt is compared in detail with other places",
+        "of a map, from which a scan is compared in detail with many places, unless its answer is beyond doubt",
         "in a building of 40 rooms a view 2 m across was ok with 0.986 in a wrong room",
     )

@@ -94,7 +94,8 @@ class Finder:
                 level = self._other(search, cloud, own)
             elif look == "finer":
                 known = [*known, *(T for first in known[:1] for T in whole.twins(first, count))]
-                if detail is None and not twinned:
+                many = search.query.num_windows >= expert().detail.many_places
+                if detail is None and many and not twinned:
                     detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
                 if fitting:  # few places, for a fine grid, unless more are asked for than usual
                     best_fits = expert().detail.close * fitting[0][0]

@@ -52,7 +52,7 @@ class Parallel:
         most = known.different_shift * self.threshold
         if not are_different(T_a, T_b, source, most):
             return False
-        shift, turn = motions_apart(T_a, T_b, source.points.mean(0))
+        shift, turn = motions_apart(T_a, T_b, source.center)
         farther = shift > known.far_apart * most or turn > known.far_apart * known.different_turn_deg
         return not self.wanted or farther or are_different(self(T_a), self(T_b), source, most)
 

@@ -4,7 +4,7 @@ A scan that sees a whole room fits into it as it stands and, where the room repe
 Matches show that place badly: seen from the same side, features are more alike than the same thing's from two sides,
 so the wrong place may have nearly all of them. Surfaces know no sides: the source, turned by the right angles of
 the target's walls, is laid on the target wherever most of both coincides. Place: decide, of answers that are likely.
-About 20 ms, and none for scans that look to one side. Of clouds that reach far what lies about the shared surface is
+Some 50 ms, and none for scans that look to one side. Of clouds that reach far what lies about the shared surface is
 asked alone.
 """
 

@@ -109,7 +109,7 @@ def test_on_a_part_of_a_map_the_sensors_of_the_whole_are_asked(monkeypatch):
 
     def search(line, scan, compared, level, own, clock, sight=None):
         asked.append((level, sight))
-        return SimpleNamespace(level=level, candidates=lambda **_: [])
+        return SimpleNamespace(level=level, query=SimpleNamespace(num_windows=1), candidates=lambda **_: [])
 
     monkeypatch.setattr(finding, "prepare", lambda *_, **__: None)
     monkeypatch.setattr(finding, "described", lambda *_: (None, None))

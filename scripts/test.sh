@@ -49,4 +49,6 @@ if [ $# -eq 0 ]; then
     tests/test_registration.py
 fi
 say "pytest"
+# All of them take half an hour of one core, so they are shared by two to four; those of one file stay together.
+if [ $# -eq 0 ]; then set -- -n auto --maxprocesses 4 --dist loadfile; fi
 exec "$python" -m pytest "$@"

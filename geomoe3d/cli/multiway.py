@@ -133,7 +133,7 @@ def summary(model: SceneModel) -> str:
         closed = sum(loop.closes for loop in group.loops)
         lines.append(
             f"  group {number}: {counted(len(group.poses), 'scan')} in the frame of '{group.reference}'; "
-            f"{closed} of {counted(len(group.loops), 'loop')} close"
+            f"loops that close: {closed} of {len(group.loops)}"
         )
         said = [text for text in (group.repeated, group.bent) if text]
         lines += [click.style(f"    {text}", fg="yellow") for text in said]

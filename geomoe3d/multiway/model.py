@@ -119,9 +119,9 @@ class SceneGroup:
             return ""
         worst = open_loops[0]
         return (
-            f"{len(open_loops)} of {counted(len(self.loops), 'loop')} do not close: going round by "
-            f"'{worst.scans[0]}' and '{worst.scans[-1]}' ({counted(len(worst.scans), 'scan')}) ends {worst.shift:.3g} "
-            f"and {worst.turn_deg:.1f} deg off; the group may be bent there"
+            f"loops that do not close: {len(open_loops)} of {len(self.loops)}. The worst, by '{worst.scans[0]}' and "
+            f"'{worst.scans[-1]}' ({counted(len(worst.scans), 'scan')}), ends {worst.shift:.3g} and "
+            f"{worst.turn_deg:.1f} deg off; the group may be bent there"
         )
 
     @property

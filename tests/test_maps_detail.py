@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from generated_buildings import AWAY, GRID, shift
@@ -9,8 +11,9 @@ from generated_buildings import AWAY, GRID, shift
 from geomoe3d import Map
 from geomoe3d.config import load_config
 from geomoe3d.geometry.se3 import make_transform, motions_apart, shift_frames
-from geomoe3d.maps.detail import Detail
+from geomoe3d.maps.detail import FITS_IN_DETAIL, Detail
 from geomoe3d.maps.finding import FITS_BETTER
+from geomoe3d.maps.locate import Found, Search
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.types import Hypothesis
 
@@ -31,6 +34,8 @@ def detail():
     voxels = VoxelSums.empty(0.02, np.zeros(3)).added(wall(6.0, 4.5))
     points = wall(1.0, 0.5)[::7]
     normals = np.where(np.arange(len(points))[:, None] < 10_000 / 7, [0.0, -1.0, 0.0], [0.0, 0.0, 1.0])
+    drawn = np.random.default_rng(0).permutation(len(points))
+    points, normals = points[drawn], normals[drawn]
     return Detail(voxels, 0.025, points, normals, points.mean(0), 1.0, None)
 
 
@@ -48,6 +53,36 @@ def test_what_is_off_by_little_is_drawn_to_its_place(detail):
     assert away < 0.02
     assert turned < 0.3
     assert detail.score(T) > 0.95
+
+
+def test_motions_are_drawn_closer_together_as_each_is_alone(detail):
+    starts = make_transform(
+        np.tile(np.eye(3), (3, 1, 1)), np.array([[4.0, 0.03, 0.03], [1.0, -0.02, 0.01], [100.0, 0.0, 0.0]])
+    )
+    for together, start in zip(detail.polished(starts), starts, strict=True):
+        np.testing.assert_allclose(together, detail.polished(start), atol=1e-9)
+
+
+class Decided:
+    """A decision of which only the answer and the doubt are asked."""
+
+    def __init__(self, answer, reason=None):
+        self.answer, self.reason = answer, reason
+
+    def doubted(self, reason):
+        return Decided(self.answer, reason)
+
+
+def test_what_fits_best_in_detail_comes_first_and_is_not_ok_where_it_did_not(detail):
+    there, plain = (Hypothesis(make_transform(np.eye(3), np.array([x, 0.0, 0.0]))) for x in (4.0, 1.0))
+    search = SimpleNamespace(
+        look=lambda h, fully: h, decide=lambda found: (Found(None, Decided(found[0]), sure=True), [])
+    )
+    before = Found(None, Decided(plain))
+    best, ranked = detail.ordered(search, before, [plain, there])
+    assert ranked == [there, plain]
+    assert (best.decision.answer, best.decision.reason, best.sure) == (there, FITS_IN_DETAIL, False)
+    assert detail.ordered(search, before, [there, plain]) == (before, [there, plain])
 
 
 def test_where_nothing_is_near_a_motion_is_worth_nothing_and_stays(detail):
@@ -82,14 +117,16 @@ def test_an_answer_is_not_ok_where_the_scan_fits_better_elsewhere(doubting, scan
 
 def test_many_windows_find_what_the_likeliest_do_not(doubting, scan, monkeypatch):
     """The looks before it are given windows in which nothing fits: what is found in detail is the answer."""
-    from geomoe3d.maps.locate import Search
+    asked = []
 
     def none(self, **how):
+        asked.append((how["more"], bool(how["given"])))
         return [] if not how["given"] else [(1.0, Hypothesis(T)) for T in how["given"]]
 
     monkeypatch.setattr(Search, "candidates", none)
     found = doubting.locate(scan[0])
     assert shift(found.T_map_scan, scan[1]) < 0.05
+    assert asked == [(False, False), (True, True)]  # no further look at the whole map
 
 
 def test_a_grid_made_in_the_end_is_not_asked_first(house):

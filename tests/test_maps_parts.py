@@ -19,11 +19,11 @@ from geomoe3d.maps import finding
 from geomoe3d.maps.facing import both_sides, facing_alike
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.locate import Search
-from geomoe3d.maps.places import Query, Window
+from geomoe3d.maps.places import Query, Window, likest
 from geomoe3d.maps.sight import Sight, seen_through
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import PointCloud, PreparedCloud
+from geomoe3d.types import Hypothesis, PointCloud, PreparedCloud
 
 UTM = np.array([583394.0, 5283100.0, 498.0])
 
@@ -70,6 +70,27 @@ def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
     assert Search.quick(search, np.eye(4)) == 0.0
     search._view = None
     assert Search.quick(search, np.eye(4)) == 1.0
+
+
+def test_a_place_is_followed_by_those_where_the_map_is_the_same():
+    def at(x):
+        return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+    search = SimpleNamespace(
+        differ=lambda a, b: abs(a.T_target_source[0, 3] - b.T_target_source[0, 3]) > 0.5,
+        twins=lambda T, count: [at(T[0, 3] + 10.02), at(T[0, 3] + 20)],
+    )
+    ranked = [Hypothesis(at(x), scores={}) for x in (0.0, 5.0, 10.0)]
+    listed = finding._with_twins(search, ranked, 5)
+    assert [h.T_target_source[0, 3] for h in listed] == [0.0, 10.0, 20.0, 5.0, 15.02]
+    assert finding._with_twins(search, ranked, 2) == [ranked[0], ranked[2]]
+
+
+def test_as_many_windows_are_looked_into_for_copies_as_copies_are_asked_for():
+    windows = [Window(np.array([float(x), 0, 0]), np.arange(3), 1.0) for x in (0, 1.2, 1.4, 2, 3, 4, 5)]
+    windows.append(Window(np.array([6.0, 0, 0]), np.arange(3), 0.1))  # too few votes
+    for most, expected in ((1, [1.2, 2]), (3, [1.2, 1.4, 2, 3, 4])):
+        assert [w.center[0] for w in likest(windows, np.zeros(3), 1.0, most)] == expected
 
 
 def test_where_a_sensor_of_the_map_saw_through_no_surface_stands():

@@ -264,10 +264,15 @@ class LocatingExpert(Section):
     )
 
 
+_Count = Annotated[int, Field(ge=1, le=1_000_000)]
+_Counts = tuple[_Count, _Count, _Count]
+_Reach = Annotated[float, Field(ge=0.1, le=100)]
+
+
 class DetailExpert(Section):
     """A small scan against all that a map keeps (`maps/detail.py`)."""
 
-    asked: int = constant(600, "points", (10, 1_000_000), "of the scan")
+    asked: _Counts = constant((100, 300, 600), "points", None, "of the scan, round by round")
     asked_back: int = constant(1500, "points", (10, 1_000_000), "of the map")
     finest: float = constant(
         1.25, "voxels", (1, 100), "of what a map keeps, of the grid of the scan at least"
@@ -283,19 +288,30 @@ class DetailExpert(Section):
     seen_through: float = constant(
         2.0, "voxels", (0, 1000), "in front of what the scan's sensor saw, from which on it saw through"
     )
-    polishing: Annotated[tuple[Annotated[float, Field(ge=0.1, le=100)], ...], Field(min_length=1)] = constant(
-        (5.0, 5.0, 3.5, 3.5, 2.5, 2.5), "voxels", None, "within which points are matched, step by step"
+    polishing: tuple[_Reach, _Reach, _Reach] = constant(
+        (8.0, 4.0, 2.5), "voxels", None, "within which points are matched, round by round"
     )
+    steps: int = constant(3, "steps", (1, 100), "of a round, by which a transform is drawn closer")
     damping: float = constant(
         0.1, "points", (0, 1000), "added to what holds a transform that is drawn closer"
     )
-    windows: int = constant(400, "windows", (1, 10_000), "that are looked into")
-    per_window: int = constant(
-        4, "hypotheses", (1, 1000), "of a window, and as many of the matches that are each other's best"
+    windows: int = constant(
+        200,
+        "windows",
+        (1, 10_000),
+        "that are looked into",
+        "seven of eight small views had their place among the first 101",
     )
-    per_window_polished: int = constant(6, "hypotheses", (1, 1000), "of a window, that are drawn closer")
-    least: float = constant(0.4, "quick score", (0, 1), "of a transform that is drawn closer")
-    compared: int = constant(300, "transforms", (1, 100_000), "the likeliest, that are compared in detail")
+    around_points: int = constant(
+        40_000,
+        "points",
+        (1000, 100_000_000),
+        "at most, of what is described anew around the places that fit in detail",
+    )
+    per_window: int = constant(8, "hypotheses", (1, 1000), "of a window")
+    per_window_polished: int = constant(3, "hypotheses", (1, 1000), "of a window, that are drawn closer")
+    least: float = constant(0.35, "share", (0, 1), "of its points on the map's planes, of such a transform")
+    compared: _Counts = constant((300, 80, 40), "transforms", None, "that are left after each round")
     close: float = constant(
         0.9, "share", (0, 1), "of the best score in detail, from which a place is compared as pairs are"
     )

@@ -80,6 +80,7 @@ class Finder:
         own, coarsest = self._grids(cloud)
         whole = self._begun(cloud, view, self.level_for(own, coarsest, expert().maps.asked_points), clock)
         search, twinned = whole, False
+        many = whole.query.num_windows >= expert().detail.many_places
         detail: Detail | None = None
         fitting: Fitting = []
         known: list[FloatArray] = []
@@ -87,23 +88,26 @@ class Finder:
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
+            if look == "more" and many and detail is None and not twinned:
+                detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
             # Once places that are alike are known, or what fits in detail, only a finer grid may tell them apart.
             if (twinned or detail is not None) and look in ("more", "other"):
                 continue
             if look == "other":
                 level = self._other(search, cloud, own)
             elif look == "finer":
-                known = [*known, *(T for first in known[:1] for T in whole.twins(first, count))]
-                many = search.query.num_windows >= expert().detail.many_places
-                if detail is None and many and not twinned:
-                    detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
-                if fitting:  # few places, for a fine grid, unless more are asked for than usual
-                    best_fits = expert().detail.close * fitting[0][0]
-                    fits = [T for score, T in fitting if score >= best_fits]
-                    known = [*fits, *known] if times > 1.0 else fits
+                best_fits = expert().detail.close * fitting[0][0] if fitting else 0.0
+                fits = [T for score, T in fitting if score >= best_fits]
+                if (
+                    not fits or times > 1.0
+                ):  # few places, for a fine grid, unless more are asked for than usual
+                    known = [*fits, *known, *(T for first in known[:1] for T in whole.twins(first, count))]
+                else:
+                    known = list(fits)
                 if best is not None and best.decision.answer is not None:
                     known.append(best.decision.T_target_source)
-                level = self._around(search, known, own)
+                most = expert().detail.around_points if fits else expert().maps.around_points
+                level = self._around(search, known, own, most)
             else:
                 level = search.level
             if level is None:
@@ -129,6 +133,8 @@ class Finder:
                 known += twins
                 twinned = twinned or sum(f.stood for f in found) > 1
             latest, others = search.decide(found)
+            if look == "finer" and detail is not None and not latest.sure:
+                latest, others = detail.ordered(search, latest, others)
             # The last look has seen the answers before it, and more of the scan than they did.
             if best is None or latest.sure or look == "finer" or latest.confidence > best.confidence:
                 # Where it is not sure either, what they found follows what it found.
@@ -138,7 +144,7 @@ class Finder:
             if not latest.sure:
                 continue
             beyond_doubt = latest.confidence >= expert().locating.checked_below or where is not None
-            if beyond_doubt or search.query.num_windows < expert().detail.many_places:
+            if beyond_doubt or not many:
                 break
             if detail is None:
                 detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
@@ -148,6 +154,8 @@ class Finder:
         if best is None or best.decision.answer is None:
             return None, []
         decision = best.decision
+        if times > 1.0 and decision.judgement.status != "ok":
+            ranked = _with_twins(whole, ranked, count)
         read = (given, self.name), best.pair.clouds, best.pair.clouds[0].voxel_size, view is not None
         told_of = remarks(*read, self.line.config.preparation, decision.judgement)
         prior = self._prior_notes(search, decision.T_target_source, near, local)
@@ -215,13 +223,14 @@ class Finder:
         level = self.level_for(sought, finer * sought, expert().maps.most_points)
         return None if level is search.level else level
 
-    def _around(self, search: Search, motions: Sequence[FloatArray], size: float) -> Level | None:
-        """The map around some places, on a scan's own grid; None where that is no finer than the search's."""
+    def _around(self, search: Search, motions: Sequence[FloatArray], size: float, most: int) -> Level | None:
+        """The map around some places, on a scan's own grid or one of so many points at most; None where that is no
+        finer than the search's."""
         if search.level.voxel_size <= expert().maps.finer * size or not motions:
             return None
         centers = [transform_points(T, search.center[None])[0] for T in motions]
         around = self.voxels.within(np.array(centers), 2 * search.reach)
-        size = max(size, around.edge, around.edge_for(expert().maps.around_points))
+        size = max(size, around.edge, around.edge_for(most))
         if search.level.voxel_size <= expert().maps.finer * size:
             return None
         try:
@@ -238,10 +247,17 @@ class Finder:
         count: int,
         clock: StageClock,
     ) -> tuple[Detail | None, Fitting]:
-        """The scan in detail, and where in the map it fits best; None where that is no finer than the search's grid."""
+        """The scan in detail, and where in the map it fits best; None where that is no finer than the search's grid.
+
+        Motions are proposed on a finer grid of the whole map where the scan asks for one: on a coarse one a small scan
+        has some twenty points to match, and of its place nothing is proposed.
+        """
         size = max(own, expert().detail.finest * self.voxels.edge)
         if search.level.voxel_size <= expert().maps.finer * size:
             return None, []
+        other = self._other(search, cloud, own)
+        if other is not None and other.voxel_size < search.level.voxel_size:
+            search = self._begun(cloud, view, other, clock)
         clock("detail")
         fine = prepare(cloud, size, self._prepared_as(cloud), viewpoint=view, seed=self.line.config.seed)
         detail = Detail.of(fine, self.voxels, search, self.line.config.seed)
@@ -280,3 +296,18 @@ class Finder:
                     f"the first guess is not the answer: it lies {turn:.1f} deg and {shift:.3g} away"
                 )
         return notes
+
+
+def _with_twins(search: Search, ranked: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
+    """Places, best first, each followed by those where the map is as it is there, so many together: in a copy of a room
+    the scan fits as well, and which of the copies came first is chance."""
+    listed: list[Hypothesis] = []
+    for place in ranked:
+        if len(listed) < count and all(search.differ(place, other) for other in listed):
+            listed.append(place)
+            for T in search.twins(place.T_target_source, count):
+                twin = replace(place, T_target_source=T)
+                known = next((h for h in ranked if not search.differ(h, twin)), twin)
+                if all(search.differ(known, other) for other in listed):
+                    listed.append(known)
+    return listed[:count]

@@ -26,7 +26,7 @@ from geomoe3d.decision.selection import Selection
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Compared, Level
-from geomoe3d.maps.places import Query, Window
+from geomoe3d.maps.places import Query, Window, likest
 from geomoe3d.maps.sight import Sight, seen_factor
 from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
@@ -99,7 +99,7 @@ class Search:
         reach = np.linalg.norm(scan.points - self.center, axis=1)
         self.reach = float(np.quantile(reach, expert().locating.reach))
         threshold = self.config.estimator.inlier_threshold * scan.voxel_size
-        self._apart = expert().selection.different_shift * threshold
+        self.apart = expert().selection.different_shift * threshold
         margin = expert().locating.margin * scan.voxel_size
         self._box = scan.points.min(0) - margin, scan.points.max(0) + margin
         clock("places")
@@ -177,6 +177,9 @@ class Search:
         drawn = np.random.default_rng(self.config.seed).permutation(len(near))[: known.twin_asked]
         query = Query(part.take(np.sort(drawn)), level, seed=self.config.seed)
         own, place = self.quick(T), Hypothesis(T)
+        # A copy of a room repeats what lies around the place, too, which a piece of wall elsewhere does not.
+        wider = np.flatnonzero(np.linalg.norm(points - center, axis=1) < known.twin_apart * self.reach)
+        wider = level.rows[wider[:: math.ceil(len(wider) / known.twin_asked)]]
         least, worth = known.close * own, known.worth_polishing * own
 
         def sought(window: Window) -> tuple[float, Hypothesis] | None:
@@ -186,11 +189,18 @@ class Search:
             if not moved or self.quick(moved[0].T_target_source, worth) <= worth:
                 return None
             twin = self.polished(moved[0].T_target_source)
-            score = self.quick(twin, least)
-            return (score, Hypothesis(twin)) if score > least else None
+            if self.quick(twin, least) <= least:
+                return None
+            moved_there = twin @ inverse(T)
+            there, normals = transform_points(moved_there, level.points[wider]), level.normals[wider]
+            distance, nearest = level.tree.query(there, distance_upper_bound=2 * level.voxel_size)
+            hit = np.isfinite(distance)
+            found = level.normals[np.asarray(nearest)[hit]]
+            cosine = np.abs(np.einsum("ij,ij->i", normals[hit] @ moved_there[:3, :3].T, found))
+            return float((cosine > expert().surfaces.least_cosine).sum() / len(wider)), Hypothesis(twin)
 
-        likest = each(sought, _likest(windows, center, self.reach))
-        found = [twin for twin in likest if twin is not None]
+        alike = each(sought, likest(windows, center, self.reach, max(known.twin_windows, count)))
+        found = [twin for twin in alike if twin is not None]
         distinct: list[Hypothesis] = []
         for _, h in sorted(found, key=lambda item: -item[0]):
             if len(distinct) < count and all(self.differ(h, other) for other in distinct):
@@ -236,7 +246,7 @@ class Search:
     def differ(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two motions are clearly different."""
         shift, turn = motions_apart(a.T_target_source, b.T_target_source, self.center)
-        return shift > self._apart or turn > expert().selection.different_turn_deg
+        return shift > self.apart or turn > expert().selection.different_turn_deg
 
     def look(self, hypothesis: Hypothesis, *, fully: bool = False) -> Found:
         """The ordinary line on the scan and the map around where a motion puts it.
@@ -374,18 +384,6 @@ class Search:
         part = replace(self._part, viewpoint=None if self.scan.viewpoint is None else eye)
         self._clock("features")
         return level.seen_from(eye, rows, part, self._line.descriptor, fully)
-
-
-def _likest(windows: Sequence[Window], center: FloatArray, reach: float) -> list[Window]:
-    """Of windows, most votes first, those that are likest to what lies within ``reach`` of a place (3,), which is none
-    of them: some that share points with it, whose votes are its own in part, and some that do not."""
-    known = expert().locating
-    away = [float(np.linalg.norm(window.center - center)) / reach for window in windows]
-    chosen: list[Window] = []
-    for low, high in ((1.0, known.twin_apart), (known.twin_apart, np.inf)):
-        some = [w for w, d in zip(windows, away, strict=True) if low <= d < high]
-        chosen += [w for w in some if w.votes >= known.twin_share * some[0].votes][: known.twin_windows]
-    return chosen
 
 
 def _score(candidate: tuple[float, Hypothesis]) -> float:

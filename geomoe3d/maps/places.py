@@ -9,6 +9,7 @@ product of the compared points of both (0.1 s for a map of 100,000 points on the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -186,6 +187,19 @@ class Query:
             seed=self.seed,
             surroundings=Surroundings.of(matched, threshold),
         )
+
+
+def likest(windows: Sequence[Window], center: FloatArray, reach: float, most: int) -> list[Window]:
+    """Of windows, most votes first, those that are likest to what lies within ``reach`` of a place (3,), which is none
+    of them: some that share points with it, whose votes are its own in part, and some that do not; of each at most so
+    many."""
+    known = expert().locating
+    away = [float(np.linalg.norm(window.center - center)) / reach for window in windows]
+    chosen: list[Window] = []
+    for low, high in ((1.0, known.twin_apart), (known.twin_apart, np.inf)):
+        some = [w for w, d in zip(windows, away, strict=True) if low <= d < high]
+        chosen += [w for w in some if w.votes >= known.twin_share * some[0].votes][:most]
+    return chosen
 
 
 def _votes(most: Float32Array) -> FloatArray:

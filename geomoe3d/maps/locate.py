@@ -168,7 +168,8 @@ class Search:
         self._clock("twins")
         level, known = self.level, expert().locating
         center, points = transform_points(T, self.center[None])[0], level.points[level.rows]
-        near = np.flatnonzero(np.linalg.norm(points - center, axis=1) < self.reach)
+        away = np.linalg.norm(points - center, axis=1)
+        near = np.flatnonzero(away < self.reach)
         if len(near) < expert().maps.least_twin:
             return []
         part = Compared(points[near], level.normals[level.rows[near]], level.features[near])
@@ -178,7 +179,7 @@ class Search:
         query = Query(part.take(np.sort(drawn)), level, seed=self.config.seed)
         own, place = self.quick(T), Hypothesis(T)
         # A copy of a room repeats what lies around the place, too, which a piece of wall elsewhere does not.
-        wider = np.flatnonzero(np.linalg.norm(points - center, axis=1) < known.twin_apart * self.reach)
+        wider = np.flatnonzero(away < known.twin_apart * self.reach)
         wider = level.rows[wider[:: math.ceil(len(wider) / known.twin_asked)]]
         least, worth = known.close * own, known.worth_polishing * own
 

@@ -144,3 +144,15 @@ def test_a_negative_seed_and_a_folder_that_is_a_file_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="folder"):
         write_sample_pair(tmp_path / "file")
+
+
+def test_the_same_pair_written_again_is_left_as_it_is_and_another_one_refused(tmp_path):
+    paths = write_sample_pair(tmp_path)
+    times = [path.stat().st_mtime_ns for path in paths]
+    assert write_sample_pair(tmp_path) == paths
+    assert [path.stat().st_mtime_ns for path in paths] == times
+    with pytest.raises(OutputError, match="exists; pass --force"):
+        write_sample_pair(tmp_path, seed=1)
+    paths.truth.write_text("mine")
+    with pytest.raises(OutputError, match="exists; pass --force"):
+        write_sample_pair(tmp_path)

@@ -9,10 +9,11 @@ About two seconds and 200 MB, most of it the import of Open3D, which casts the r
 
 from __future__ import annotations
 
+import filecmp
 import os
-from dataclasses import dataclass
+import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,7 @@ from geomoe3d.types import FloatArray, PointCloud
 _CAMERA = Camera(320, 240, 262.5)  # 63 by 49 degrees
 
 
-@dataclass(frozen=True)
-class SamplePaths:
+class SamplePaths(NamedTuple):
     """Files of a written sample pair."""
 
     source: Path
@@ -66,9 +66,11 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
         seed: as in `make_sample_pair`; same seed, same bytes.
         force: True replaces files of an earlier pair.
 
+    Called again, it leaves files that hold this very pair as they are.
+
     Raises:
-        OutputError: the folder cannot be made or written, or a file exists and ``force`` is False; then
-            nothing has been written.
+        OutputError: the folder cannot be made or written, or a file of other content exists and ``force`` is False;
+            then nothing has been written.
         InputError: the seed is negative.
     """
     from geomoe3d.clouds.io import save_points
@@ -78,7 +80,12 @@ def write_sample_pair(folder: str | os.PathLike[str], seed: int = 0, force: bool
     folder = Path(folder)
     make_folder(folder)
     paths = SamplePaths(folder / "source.ply", folder / "target.ply", folder / "T_target_source.txt")
-    for path in (paths.source, paths.target, paths.truth):
+    if not force and all(path.is_file() for path in paths):
+        with tempfile.TemporaryDirectory() as place:
+            again = write_sample_pair(place, seed)
+            if all(filecmp.cmp(*both, shallow=False) for both in zip(paths, again, strict=True)):
+                return paths
+    for path in paths:
         check_output(path, force=force)
     source, target, T_target_source = make_sample_pair(seed)
     for path, cloud in ((paths.source, source), (paths.target, target)):

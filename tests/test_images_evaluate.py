@@ -17,6 +17,7 @@ from geomoe3d.images.config import MEASURE
 from geomoe3d.images.evaluate import (
     Outcome,
     area_under_recall,
+    evaluate,
     summarise,
 )
 from geomoe3d.networks.architecture import NetworkConfig
@@ -179,3 +180,40 @@ def test_homographies_of_all_three_kinds(tmp_path):
         found = json.loads((tmp_path / "h.json").read_text())
         assert len({one["pair"] for one in found["pairs"]}) == pairs
         assert found["summary"]["ratio test, RANSAC"][f"auc {MEASURE.corner[1]:g}"]["value"] > 60
+
+
+def test_what_was_finished_before_a_stop_is_kept_and_other_settings_are_refused(tmp_path, monkeypatch):
+    folder, kept = tmp_path / "plain", tmp_path / "kept"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "any.png"), texture())
+    words = (
+        "evaluate",
+        "images",
+        folder,
+        "--homographies",
+        "--keep",
+        kept,
+        "--output",
+        tmp_path / "h.json",
+        "--force",
+    )
+    assert run(*words).exception is None
+    whole = json.loads((tmp_path / "h.json").read_text())["pairs"]
+    journal = kept / "1-plain" / "predictions.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    assert len(lines) == 2
+    journal.write_text(lines[0] + lines[1][:50])  # as a stop in the middle leaves it
+    asked = []
+
+    def counting(scene, cases, network):
+        cases = list(cases)
+        asked.extend(case.name for case in cases)
+        return evaluate(scene, cases, network)
+
+    monkeypatch.setattr("geomoe3d.images.evaluate.evaluate", counting)
+    assert run(*words).exception is None
+    assert asked == ["any/1"]
+    again = json.loads((tmp_path / "h.json").read_text())["pairs"]
+    assert [{**one, "seconds": 0} for one in again] == [{**one, "seconds": 0} for one in whole]
+    done = run(*words, "--pairs", "4")
+    assert isinstance(done.exception, InputError) and "pairs (200 there, 4 now)" in str(done.exception)

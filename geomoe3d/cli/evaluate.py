@@ -185,12 +185,17 @@ def methods() -> None:
 )
 @click.option("--homographies", is_flag=True, help="Homographies in place of poses.")
 @click.option("--images", type=click.Path(), help="Where the images of a list of pairs lie.")
+@click.option(
+    "--keep",
+    type=click.Path(file_okay=False),
+    help="Folder that keeps each finished pair: the same call goes on where it was stopped.",
+)
 @click.option("--output", type=click.Path(), help="Write all errors as JSON.")
 @click.option("--force", is_flag=True, help="Replace a file that exists.")
 @traceback_option
 def images(
     folders: tuple[str, ...], weights: str | None, pairs: int, homographies: bool, images: str | None,
-    output: str | None, force: bool,
+    keep: str | None, output: str | None, force: bool,
 ) -> None:  # fmt: skip
     """Measure poses or homographies of photographs: areas under the recall curve, with intervals.
 
@@ -203,9 +208,9 @@ def images(
     from geomoe3d.cli.progress import progress_bar
     from geomoe3d.images.cases import cases_of
     from geomoe3d.images.config import MEASURE
-    from geomoe3d.images.evaluate import Outcome, evaluate, summarise, to_markdown
+    from geomoe3d.images.evaluate import Outcome, evaluate, evaluate_kept, summarise, to_markdown
     from geomoe3d.images.network import ImageNetwork
-    from geomoe3d.runtime.files import check_output, write_text
+    from geomoe3d.runtime.files import check_output, file_hash, write_text
     from geomoe3d.runtime.plain import plain
 
     if output is not None:
@@ -218,7 +223,14 @@ def images(
     with progress_bar("scenes") as advance:
         advance(0, len(folders))
         for number, (name, folder) in enumerate(zip(names, folders, strict=True), 1):
-            outcomes += evaluate(name, cases_of(Path(folder), pairs, homographies, root), network)
+            cases = cases_of(Path(folder), pairs, homographies, root)
+            if keep is None:
+                outcomes += evaluate(name, cases, network)
+            else:
+                used = None if weights is None else file_hash(Path(weights))
+                given = {"folder": folder, "images": images, "pairs": pairs, "homographies": homographies}
+                place = Path(keep) / f"{number}-{Path(folder).resolve().stem}"
+                outcomes += evaluate_kept(place, name, {**given, "weights": used}, cases, network)
             advance(number, len(folders))
     table = summarise(outcomes, MEASURE.corner if homographies else MEASURE.pose)
     click.echo(to_markdown(table, len({(one.scene, one.pair) for one in outcomes})), nl=False)

@@ -10,19 +10,27 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.intervals import Quantity, measure_all
 from geomoe3d.evaluation.metrics import precision_recall_f1
-from geomoe3d.evaluation.records import Measure
+from geomoe3d.evaluation.predictions import open_run
+from geomoe3d.evaluation.records import Measure, RunInfo
 from geomoe3d.evaluation.report_text import markdown_table
 from geomoe3d.evaluation.report_words import with_intervals
 from geomoe3d.images.cases import Case
 from geomoe3d.images.config import KEYPOINTS
 from geomoe3d.images.network import ImageNetwork
+from geomoe3d.runtime.journal import read_journal
+from geomoe3d.runtime.plain import plain
+from geomoe3d.runtime.provenance import hardware, source_commit
+from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
@@ -93,6 +101,38 @@ def evaluate(scene: str, cases: Iterable[Case], network: ImageNetwork | None) ->
             share = float(true.mean()) if len(true) else 0.0
             yield Outcome(scene, case.name, f"{which}, {name}", error, status, seconds, len(found), share,
                           *precision_recall_f1(kept, true), case.turned)  # fmt: skip
+
+
+def evaluate_kept(
+    folder: Path, scene: str, identity: dict[str, Any], cases: Iterable[Case], network: ImageNetwork | None
+) -> list[Outcome]:
+    """`evaluate`, each finished pair kept in a folder, as `evaluate predict` keeps its own, and not asked again.
+
+    Args:
+        folder: of this scene alone; made if missing.
+        identity: what decides the outcomes beside the code.
+
+    Raises:
+        InputError: what the folder keeps of the scene is of another identity.
+        OutputError: the folder cannot be written, or another process is writing it.
+    """
+    code = {"code": source_hash(__name__), "libraries": library_versions(source_closure(__name__))}
+    info = RunInfo(
+        "images", "images", "photographs", scene, {**identity, **code}, source_commit(), hardware(), 0, "",
+        datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    )  # fmt: skip
+    journal, done = open_run(folder, info)
+    with journal:
+        for case in cases:
+            if case.name not in done:
+                found = [plain(one) for one in evaluate(scene, [case], network)]
+                journal.append({"pair": case.name, "outcomes": found})
+    missing = {"error": math.inf, "turned": math.nan}  # JSON has neither
+    return [
+        Outcome(**{**one, **{name: value for name, value in missing.items() if one[name] is None}})
+        for record in read_journal(journal.path)
+        for one in record["outcomes"]
+    ]
 
 
 def peers_of(method: str, methods: Iterable[str]) -> list[str]:

@@ -21,7 +21,7 @@ from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.correspondence_registration import between_clouds
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision, failed_result, finished_result
-from geomoe3d.decision.causes import Register, differing_units, is_sure, mirrored_axes
+from geomoe3d.decision.causes import Register, differing_units, is_sure, look_like_one_scene, mirrored_axes
 from geomoe3d.decision.choosers import have_margin
 from geomoe3d.decision.confidence import Judgement
 from geomoe3d.decision.explanation import Explanation
@@ -129,7 +129,7 @@ class Line:
         with single_blas_thread():
             found = each(lambda task: task(), tasks)
         if decision.answer is not None:
-            decision = found[1].with_scale(found[0], exchanged=exchanged)
+            decision = found[1].with_scale(found[0], (clouds[0].name, clouds[1].name), exchanged=exchanged)
         if decision.judgement.status != "ok":
             units = self._units(clouds[::-1] if exchanged else clouds)
             decision = decision if units is None else decision.with_note(units, first=True)
@@ -361,6 +361,9 @@ class Line:
         from geomoe3d.maps.larger import search_larger
         from geomoe3d.maps.location import nowhere
 
+        early = self._units(clouds) if look_like_one_scene(clouds) else None
+        if early is not None:  # no map: seen before it is described and searched
+            return Explanation(failed_result(clouds, early, self.config, self.clock.stop()), *clouds)
         found = search_larger(*clouds, self.pipeline, guess, self.clock)
         if found is None or found.decision.answer is None:
             reason = nowhere(*(cloud.name for cloud in clouds))

@@ -40,10 +40,12 @@ class RegistrationResult:
             cloud with more points, whichever the source is; the overlap from the source);
             ``overlap_target``, the share of target voxel points with a source point within the threshold;
             ``margin``, by how much the surface network prefers the answer, where it was asked;
-            ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; ``scale_ratio``
-            and ``scale_sigma``, see `geomoe3d.decision.scale.Scale`, where enough surface is shared; empty
+            ``observability`` and ``looseness``, see `geomoe3d.decision.confidence.Information`; ``scale_ratio``,
+            lengths of the source over those of the target as the surfaces have them (about 1 / ``scale`` where that was
+            estimated), and ``scale_sigma``, see `geomoe3d.decision.scale.Scale`, where enough surface is shared; empty
             where nothing was estimated.
-        scale: p_target = scale R p_source + t; 1 unless it was estimated. Lengths of a result are the target's.
+        scale: p_target = scale R p_source + t: lengths of the source times it are those of the target; 1 unless it was
+            estimated. Lengths of a result are the target's.
         accuracy: how closely the clouds lie on each other and how far off the transform may be; None where too
             little lies on each other to say, and in results of earlier versions.
         num_correspondences: correspondences given to the estimator.

@@ -119,7 +119,13 @@ def test_scale_is_told_of_the_callers_source(parts, registrar):
     answer, back = registrar.register(1.1 * source, target), registrar.register(target, 1.1 * source)
     for result, ratio in ((answer, 1.1), (back, 1 / 1.1)):
         assert result.evidence["scale_ratio"] == pytest.approx(ratio, rel=0.02)
-        assert any(f"lengths of the source are {ratio:.2f}"[:-1] in reason for reason in result.reasons)
+        said = f"lengths in 'source' are {ratio:.2f}"[:-1]
+        assert any(said in reason and "those in 'target'" in reason for reason in result.reasons)
+        turned = (
+            result.inverse()
+        )  # the number turns over; the sentence goes by names, which stay with their clouds
+        assert turned.evidence["scale_ratio"] == pytest.approx(1 / ratio, rel=0.02)
+        assert turned.reasons == result.reasons and turned.target.name == "source"
 
 
 def test_a_first_guess_and_given_correspondences_are_turned_round_too(parts, registrar):

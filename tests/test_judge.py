@@ -18,6 +18,7 @@ from geomoe3d.decision import confidence
 from geomoe3d.decision.confidence import Judgement, confidence_score, lead_over
 from geomoe3d.decision.information import Information, measure_information
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
+from geomoe3d.runtime.words import of_the_score
 from geomoe3d.scoring.network import Opinion
 from geomoe3d.scoring.surfaces import Evidence
 from geomoe3d.types import Hypothesis
@@ -234,10 +235,27 @@ def test_the_margin_of_a_second_look_makes_surer_up_to_a_bound() -> None:
 @pytest.mark.parametrize(
     ("lead", "surface", "margin", "words"),
     [
-        (0.5, 1.0, None, r"has the higher score \(200 %\); see"),  # nobody else was asked
-        (0.5, 1.0, 1.0, r"has the higher score \(200 %\), and only the surface network prefers the answer"),
-        (1.1, 1.0, None, "different transform does 91 % as well"),
-        (3.0, 0.9, None, "by the surfaces alone a clearly different transform does 90 % as well"),
+        (0.5, 1.0, None, r"fits better than this one \(2 times the score\); see"),  # nobody else was asked
+        (
+            1 / 1.97,
+            1.0,
+            1.0,
+            r"\(1.97 times the score\), and only the surface network prefers the answer; see",
+        ),
+        (
+            1.0,
+            1.0,
+            None,
+            r"^a clearly different transform fits as well as this one \(100 % of the score\); see",
+        ),
+        (1.1, 1.0, None, r"fits nearly as well as this one \(91 % of the score\)"),
+        (
+            3.0,
+            0.9,
+            None,
+            r"by the surfaces alone a clearly different transform fits nearly as well .*\(90 % of",
+        ),
+        (3.0, 1.97, 1.0, r"by the surfaces alone .* fits better than this one \(1.97 times the score\); see"),
     ],
 )
 def test_a_rival_is_told_of_by_what_makes_it_one(
@@ -247,6 +265,16 @@ def test_a_rival_is_told_of_by_what_makes_it_one(
     judged = confidence.judge(mine, rival, lead, 0.3, FIRM, DecisionConfig(), margin=margin)
     assert judged.status == "ambiguous"
     assert any(re.search(words, reason) for reason in judged.reasons)
+
+
+def test_shares_of_a_score_read_well_at_either_end() -> None:
+    said = [of_the_score(share) for share in (0.0, 0.004, 0.01, 0.5, 1.0, 1.004, 1.97, 250.0)]
+    assert said[:2] == ["under 1 % of the score"] * 2
+    assert said[2:6] == ["1 % of the score", "50 % of the score", "100 % of the score", "100 % of the score"]
+    assert said[6:] == ["1.97 times the score", "250 times the score"]
+    was = Judgement("ok", (), 0.99)
+    assert "has 1.97 times the score of this one and would" in confidence.repeated(was, 1 / 1.97).reasons[0]
+    assert "has 41 % of the score of this one and would" in confidence.repeated(was, 1 / 0.41).reasons[0]
 
 
 @pytest.mark.parametrize(("margin", "status"), [(None, "ambiguous"), (0.4, "ambiguous"), (3.0, "ok")])

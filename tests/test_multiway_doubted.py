@@ -22,7 +22,7 @@ from geomoe3d.multiway.rules import GroupingRules
 from geomoe3d.multiway.scans import Scan
 from geomoe3d.multiway.tables import scans_text
 
-SAID = Scale(1.1, 0.01).sentence()
+SAID = Scale(1.1, 0.01).sentence("a.ply", "b.ply")
 
 
 def model(said: dict[tuple[str, str], str]) -> SceneModel:

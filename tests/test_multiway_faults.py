@@ -27,7 +27,7 @@ from geomoe3d.multiway.rules import Group
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 MIRRORED = "mirrored: with x of 'b' the other way round the clouds fit clearly better; ..."
-UNITS = "units differ: with all lengths of 'b' divided by 3.28084 the clouds fit; ..."
+UNITS = "units differ: lengths in 'b' are 3.28084 times those in 'a', ..."
 
 
 def outcome(*reasons, status="low_confidence"):
@@ -49,7 +49,7 @@ def test_a_mirrored_scan_and_one_in_millimetres_are_named(tmp_path):
     assert not model.ok
     told = {**model.unplaced, **model.doubted}
     assert told["scan_1"].startswith("mirrored: 3 of 3 pairs")
-    assert told["scan_3"].startswith("units differ: with all lengths of 'scan_3.npy' divided by 1000")
+    assert told["scan_3"].startswith("units differ: lengths in 'scan_3.npy' are 1000 times those in")
     assert "'scan_3.npy' seems to be in millimetres" in told["scan_3"]
     assert set(told) == {"scan_1", "scan_3"}
     files = [tmp_path / f"scan_{number}.npy" for number in (0, 1, 2)]

@@ -16,12 +16,13 @@ from geomoe3d.config import PreparationConfig, load_config
 from geomoe3d.data.sample import make_sample_pair
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement
-from geomoe3d.decision.scale import Scale, likely_unit_ratio, measure_scale, seeming_units
+from geomoe3d.decision.scale import Scale, likely_unit_ratio, measure_scale, seeming_units, units_differ
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
 VOXEL = 0.08
+NAMES = ("a", "b")
 
 
 def prepared(points: FloatArray) -> PreparedCloud:
@@ -77,35 +78,51 @@ def test_next_to_nothing_shared_has_no_scale() -> None:
 
 
 def test_units_are_named_by_their_ratio() -> None:
-    assert seeming_units(1000.4).endswith("source seems to be in millimetres, the target in metres")
-    assert seeming_units(1 / 3.28).endswith("source seems to be in metres, the target in feet")
-    assert "inches" in seeming_units(39.37) and "centimetres" in seeming_units(0.01)
-    assert seeming_units(1.1) == "" and seeming_units(1.0) == ""
+    assert seeming_units(1000.4, ("'a'", "'b'")).endswith("'a' seems to be in millimetres, 'b' in metres")
+    assert seeming_units(1 / 3.28, ("'a'", "'b'")).endswith("'a' seems to be in metres, 'b' in feet")
+    assert "inches" in seeming_units(39.37, ("'a'", "'b'")) and "centimetres" in seeming_units(
+        0.01, ("'a'", "'b'")
+    )
+    assert seeming_units(1.1, ("'a'", "'b'")) == "" and seeming_units(1.0, ("'a'", "'b'")) == ""
     assert likely_unit_ratio((36.0, 10.0)) == pytest.approx(1 / 0.3048)
     assert likely_unit_ratio((14.0, 10.0)) is None and likely_unit_ratio((10.0, 0.0)) is None
-    assert Scale(3.28, 0.01).sentence().endswith("the source seems to be in feet, the target in metres")
+    assert Scale(3.28, 0.01).sentence("a", "b").endswith("'a' seems to be in feet, 'b' in metres")
+
+
+def test_the_larger_cloud_is_named_as_such_whichever_comes_first_and_whatever_the_names() -> None:
+    large = Scale(1.1, 0.01)
+    assert "lengths in 'a' are 1.1 times those in 'b' (+- 1.0 %)" in large.sentence("a", "b")
+    assert "lengths in 'b' are 0.9091 times those in 'a'" in large.exchanged().sentence("b", "a")
+    said = "lengths in 'scan' (the larger one) are 1.1 times those in 'scan' (the smaller one)"
+    assert said in large.sentence("scan", "scan")
+    assert units_differ(1 / 1000, "scan", "scan").endswith(
+        "'scan' (the larger one) seems to be in millimetres, 'scan' (the smaller one) in metres; bring both to one "
+        "unit, a rigid transform cannot change scale"
+    )
+    assert "lengths in 'a' are 3.28084 times those in 'b'" in units_differ(3.28084, "a", "b")
+    assert units_differ(0.3048, "b", "a") == units_differ(1 / 0.3048, "a", "b")
 
 
 def test_what_differs_is_never_ok_and_what_is_not_believed_has_no_scale() -> None:
     sure = replace(
         Decision.failed(""), answer=Hypothesis(np.eye(4)), judgement=Judgement("ok", ("so",), 0.99)
     )
-    told = sure.with_scale(Scale(1.1, 0.01)).judgement
+    told = sure.with_scale(Scale(1.1, 0.01), NAMES).judgement
     assert told.status == "low_confidence" and told.confidence < 0.8
     assert "1.1 times" in told.reasons[0] and told.reasons[1:] == ("so",)
     unsure = Judgement(
         "low_confidence", ("so", "confidence 0.92 is below 0.98"), 0.92, "confidence 0.92 is below 0.98"
     )
-    told = replace(sure, judgement=unsure).with_scale(Scale(1.1, 0.01)).judgement
+    told = replace(sure, judgement=unsure).with_scale(Scale(1.1, 0.01), NAMES).judgement
     assert (
         told.reasons[1:] == ("so",) and "1.1 times" in told.reasons[0]
     )  # not two confidences in one verdict
     for off in (Scale(1.025, 0.007), Scale(1.05, 0.018), Scale(1.08, 0.04)):
-        assert sure.with_scale(off).judgement.status == "low_confidence"
+        assert sure.with_scale(off, NAMES).judgement.status == "low_confidence"
     for fine in (Scale(1.1, 0.08), Scale(1.05, 0.02), Scale(1.025, 0.008), Scale(1.005, 0.0001), None):
-        assert sure.with_scale(fine).judgement == sure.judgement
+        assert sure.with_scale(fine, NAMES).judgement == sure.judgement
     doubtful = replace(sure, judgement=Judgement("ambiguous", ("no",), 0.1))
-    assert doubtful.with_scale(Scale(1.1, 0.01)).judgement == doubtful.judgement
+    assert doubtful.with_scale(Scale(1.1, 0.01), NAMES).judgement == doubtful.judgement
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.1])
@@ -123,10 +140,7 @@ def test_two_units_are_named_where_the_clouds_fit_in_one(factor: float, unit: st
     source, target = cut(points, 0.0, 3.6, seed=0)[0], cut(points, 0.4, 4.6, seed=1)[0]
     result = geomoe3d.register(factor * source, target)
     assert not result.ok
-    said = result.reasons[0]  # whichever of the two is asked about first
-    assert f"'source' seems to be in {unit}, 'target' in metres" in said or (
-        f"'target' seems to be in metres, 'source' in {unit}" in said
-    )
+    assert f"'source' seems to be in {unit}, 'target' in metres" in result.reasons[0]
 
 
 def test_units_are_named_also_where_the_larger_cloud_is_taken_for_a_map() -> None:

@@ -64,7 +64,7 @@ def test_feet_against_metres_is_found_and_named(
     assert scale_of(answer.T_target_source) == pytest.approx(answer.scale, rel=1e-12)
     off = np.linalg.norm(answer.apply(source) - transform_points(true, source), axis=1)
     assert np.median(off) < 0.03
-    assert "the source seems to be in feet, the target in metres" in answer.reasons
+    assert "'source' seems to be in feet, 'target' in metres" in answer.reasons
     assert answer.evidence["scale_ratio"] == pytest.approx(1 / FEET, rel=0.01)
     assert answer.accuracy is not None and answer.accuracy.sigma_center < 0.1  # metres, the target's
     assert np.linalg.norm(answer.source.origin) > 1000  # that of the source as it is
@@ -240,7 +240,7 @@ def test_the_command_line_refuses_formats_before_the_work_and_prints_the_scale(
     out = tmp_path / "a.xyz"
     assert call("register", *both, "--estimate-scale", "--output", tmp_path / "T.txt", "--aligned", out) == 0
     said = capfd.readouterr().out
-    assert "scale       0.3048 +- 0.4 %: lengths of the target over those of the source" in said
+    assert "scale       0.3048 +- 0.4 %: lengths of the source times this are those of the target" in said
     assert "p_target = 0.3048 R p_source + t" in said
     assert registrar.asked[0][2].scale == "estimate"
     np.testing.assert_array_equal(load_transform(tmp_path / "T.txt"), SIMILAR)

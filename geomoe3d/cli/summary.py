@@ -9,7 +9,7 @@ import click
 
 from geomoe3d.clouds.transform_files import has_transform, transform_text
 from geomoe3d.result import RegistrationResult
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, of_the_score
 from geomoe3d.types import CloudReport, FloatArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length, margin_facts
 
@@ -132,9 +132,7 @@ def _alternative(result: RegistrationResult, unit: str) -> str:
     other = result.alternative
     if other is None:
         return "none that differs clearly comes near"
-    share = other.relative_score
-    score = f"{100 * share:.0f} % of the score" if share <= 1 else f"{share:.3g} times the score"
     return (
-        f"{score}, "
+        f"{of_the_score(other.relative_score)}, "
         f"differs by {other.rotation_difference_deg:.1f} deg and {length(other.translation_difference, unit, '.4g')}"
     )

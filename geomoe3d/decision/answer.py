@@ -104,16 +104,20 @@ class Decision:
         told = (note, *reasons) if first else (*reasons, note)
         return replace(self, judgement=replace(self.judgement, reasons=told))
 
-    def with_scale(self, scale: Scale | None, *, exchanged: bool = False) -> Decision:
+    def with_scale(self, scale: Scale | None, names: tuple[str, str], *, exchanged: bool = False) -> Decision:
         """The same decision with the scale measured: never ok where it differs, and then that is said first.
 
-        Of an answer that is hardly believed nothing is said: its surfaces are not those of one body. ``exchanged``: the
-        sentence calls the second cloud the source.
+        Of an answer that is hardly believed nothing is said: its surfaces are not those of one body.
+
+        Args:
+            scale: of the first cloud beside the second.
+            names: of both clouds.
+            exchanged: the user calls the second of them the source.
         """
         was = self.judgement
         if scale is None or not scale.differs or was.confidence < expert().causes.least_believed:
             return replace(self, scale=scale)
-        said = (scale.exchanged() if exchanged else scale).sentence()
+        said = scale.exchanged().sentence(*names[::-1]) if exchanged else scale.sentence(*names)
         return replace(self, scale=scale).doubted(said)
 
     def doubted(self, reason: str) -> Decision:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from geomoe3d.clouds.voxel_size import robust_extent
+import numpy as np
+
+from geomoe3d.clouds.voxel_size import robust_extent, typical_spacing
 from geomoe3d.config import expert
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement
@@ -41,6 +43,17 @@ def differing_units(
     if not fits:
         return None
     return units_differ(ratio, source.name, target.name)  # not roles, which may be exchanged here
+
+
+def look_like_one_scene(clouds: tuple[PointCloud, PointCloud]) -> bool:
+    """Whether one cloud may be the other in another unit: its points lie as much farther apart as it is larger, which
+    those of a map, of about the same spacing as a scan in it, do not."""
+    sizes = [(robust_extent(cloud.points), typical_spacing(cloud.points)) for cloud in clouds]
+    (extent, spacing), (other, others_spacing) = sizes
+    if min(extent, spacing, other, others_spacing) <= 0:
+        return False
+    off = np.log((other / extent) / (others_spacing / spacing))
+    return bool(abs(off) < np.log(expert().scale.extent_tolerance))
 
 
 def is_sure(judgement: Judgement) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from geomoe3d.config import DecisionConfig, expert
 from geomoe3d.decision.information import Information
 from geomoe3d.result import Status
+from geomoe3d.runtime.words import of_the_score
 from geomoe3d.scoring.network import opinion_of
 from geomoe3d.scoring.surfaces import Evidence, evidence_of
 from geomoe3d.types import FloatArray, Hypothesis
@@ -73,7 +74,7 @@ def judge(
     if evidence.free_space_violation > limits.high_violation:
         notes.append(
             "parts lie where the other scan's sensor saw free space "
-            f"(rate {evidence.free_space_violation:.2f})"
+            f"(rate {evidence.free_space_violation:.2f}; 0 is none, 2 all of both scans)"
         )
     if information.observability < information.least_observability:
         slides = (
@@ -85,12 +86,13 @@ def judge(
             slides += "; the sensors lie on each other, so what matches may be their own pattern"
         notes.insert(0, slides)
         return Judgement("ambiguous", tuple(notes), min(confidence, limits.most_sliding))
-    if _may_be_the_pattern(evidence, rival, information):
+    if rival is not None and _may_be_the_pattern(evidence, rival, information):
+        share = 1 / lead_over(evidence.surface_score, evidence_of(rival).surface_score)
         notes.insert(
             0,
-            "the transform lays the sensors on each other, where what matches may be their own pattern, and a clearly "
-            "different one fits nearly as well; see the alternative: the scans may show repeated or symmetric "
-            "structure",
+            "the transform lays the sensors on each other, where what matches may be their own pattern, and by the "
+            f"surfaces a clearly different one has {of_the_score(share)} of this one; see the alternative: the scans "
+            "may show repeated or symmetric structure",
         )
         return Judgement("ambiguous", tuple(notes), min(confidence, limits.most_doubted))
     # Without a rival it would be likely, by the clouds alone: the network doubts what it has seen no like of.
@@ -129,18 +131,18 @@ def is_likely(judgement: Judgement) -> bool:
 def repeated(was: Judgement, lead: float) -> Judgement:
     """The judgement of an answer beside which the clouds would believe another one as well; ``lead`` by them alone."""
     twin = (
-        f"the place repeats: by the surfaces alone a clearly different transform scores {100 / lead:.0f} % of this "
+        f"the place repeats: by the surfaces alone a clearly different transform has {of_the_score(1 / lead)} of this "
         "one and would be believed by itself; see the alternative"
     )
     others = (reason for reason in was.reasons if reason != was.unspecific)
     return Judgement("ambiguous", (twin, *others), min(was.confidence, expert().confidence.most_doubted))
 
 
-def _may_be_the_pattern(evidence: Evidence, rival: Hypothesis | None, information: Information) -> bool:
+def _may_be_the_pattern(evidence: Evidence, rival: Hypothesis, information: Information) -> bool:
     """Whether an answer lays sensor on sensor, which makes any place look like any other, and has a rival that most of
     the source lies on as well."""
     limits = expert().confidence
-    if rival is None or information.sensors_apart >= limits.near_sensors:
+    if information.sensors_apart >= limits.near_sensors:
         return False
     other = evidence_of(rival)
     fits = other.surface_score >= limits.near_sensors_rival * evidence.surface_score
@@ -157,15 +159,22 @@ def _rival_note(
     lead: float, ratio: float, evidence: Evidence, rival: Hypothesis | None, margin: float | None
 ) -> str:
     """A sentence about a rival that is as good, by the score or by the surfaces alone."""
-    if lead < 1:
-        said = f"a clearly different transform has the higher score ({100 / lead:.0f} %)"
-        if margin is not None and margin > 0:
-            said += ", and only the surface network prefers the answer"
-    elif lead < 1 / ratio or rival is None:
-        said = f"a clearly different transform does {100 / lead:.0f} % as well"
-    else:
-        share = 100 * evidence_of(rival).surface_score / evidence.surface_score
-        said = f"by the surfaces alone a clearly different transform does {share:.0f} % as well"
+    by_score = lead < 1 / ratio or rival is None
+    if rival is not None and not by_score:
+        lead = lead_over(evidence.surface_score, evidence_of(rival).surface_score)
+    share = 1 / lead
+    rungs = (
+        (1.005, "better than"),
+        (0.995, "as well as"),
+        (0.75, "nearly as well as"),
+        (0.0, "less well than"),
+    )
+    fits = next(words for least, words in rungs if share >= least)
+    said = f"a clearly different transform fits {fits} this one ({of_the_score(share)})"
+    if not by_score:
+        said = f"by the surfaces alone {said}"
+    elif share >= 1.005 and margin is not None and margin > 0:
+        said += ", and only the surface network prefers the answer"
     return f"{said}; see the alternative, the scans may show repeated or symmetric structure"
 
 

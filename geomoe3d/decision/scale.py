@@ -53,13 +53,14 @@ class Scale:
         """The same of the target beside the source."""
         return replace(self, ratio=1 / self.ratio)
 
-    def sentence(self) -> str:
-        """What a user is told where it `differs`."""
+    def sentence(self, source: str, target: str) -> str:
+        """What a user is told where it `differs`, with the names of both clouds: roles may be exchanged later."""
+        names = told_apart(source, target, self.ratio)
         text = (
-            f"{DIFFERS}: lengths of the source are {self.ratio:.4g} times those of the target "
+            f"{DIFFERS}: lengths in {names[0]} are {self.ratio:.4g} times those in {names[1]} "
             f"(+- {100 * self.sigma:.1f} %), and a rigid transform cannot change scale"
         )
-        return text + seeming_units(self.ratio)
+        return text + seeming_units(self.ratio, names)
 
 
 def measure_scale(T_target_source: FloatArray, shared: SharedSurface) -> Scale | None:
@@ -132,7 +133,15 @@ class _Fit:
         return float(np.hypot(known.per_distortion * distortion, known.per_formal * formal))
 
 
-def seeming_units(ratio: float, names: tuple[str, str] = ("the source", "the target")) -> str:
+def told_apart(source: str, target: str, ratio: float) -> tuple[str, str]:
+    """Names of two clouds as messages write them; of one name, by which has the larger lengths."""
+    if source != target:
+        return f"'{source}'", f"'{target}'"
+    this, other = ("larger", "smaller") if ratio > 1 else ("smaller", "larger")
+    return f"'{source}' (the {this} one)", f"'{target}' (the {other} one)"
+
+
+def seeming_units(ratio: float, names: tuple[str, str]) -> str:
     """An end of a sentence that names the two units in which one body gives this ratio of lengths, to 2 %; else
     empty. Feet are international or US survey ones, which differ by two millionths."""
     for (source, target), expected in _unit_ratios().items():
@@ -142,11 +151,14 @@ def seeming_units(ratio: float, names: tuple[str, str] = ("the source", "the tar
 
 
 def units_differ(ratio: float, source: str, target: str) -> str:
-    """A sentence for two clouds, by name, that fit once all lengths of the first are divided by a ratio."""
-    units = seeming_units(ratio, (f"'{source}'", f"'{target}'"))
+    """A sentence for two clouds, by name, that fit once all lengths of the first are divided by the ratio."""
+    if ratio < 1:  # the larger one is named first, whichever is asked about
+        ratio, source, target = 1 / ratio, target, source
+    names = told_apart(source, target, ratio)
+    units = seeming_units(ratio, names)
     return (
-        f"{UNITS_DIFFER}: with all lengths of '{source}' divided by {ratio:.6g} the clouds fit{units}; bring both to "
-        "one unit, a rigid transform cannot change scale"
+        f"{UNITS_DIFFER}: lengths in {names[0]} are {ratio:.6g} times those in {names[1]}, and once that is taken into "
+        f"account the clouds fit{units}; bring both to one unit, a rigid transform cannot change scale"
     )
 
 

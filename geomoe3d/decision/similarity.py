@@ -20,8 +20,9 @@ import numpy as np
 from geomoe3d.clouds.voxel_size import robust_extent
 from geomoe3d.config import DecisionConfig, RegistrationConfig, expert
 from geomoe3d.decision.answer import failed_result
+from geomoe3d.decision.confidence import said_below
 from geomoe3d.decision.explanation import Explanation
-from geomoe3d.decision.scale import DIFFERS, seeming_units
+from geomoe3d.decision.scale import DIFFERS, seeming_units, told_apart
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.timing import Progress, StageClock
 from geomoe3d.types import FloatArray, PointCloud
@@ -134,8 +135,8 @@ def _one_of_many(found: Explanation, num_tried: int) -> Explanation:
     if not result.ok or confidence >= least:
         return replace(found, result=replace(result, confidence=confidence))
     reason = (
-        f"confidence {confidence:.2f} is below {least:.2f}: {num_tried} scales were tried before one fitted, and each "
-        "may look right by chance"
+        f"confidence {said_below(confidence, least)} is below {least:.2f}: {num_tried} scales were tried before one "
+        "fitted, and each may look right by chance"
     )
     doubted = replace(
         result, confidence=confidence, status="low_confidence", reasons=(reason, *result.reasons)
@@ -217,8 +218,8 @@ def as_similarity(
     reasons = list(result.reasons)
     for k, reason in enumerate(reasons):
         if reason.startswith(DIFFERS):  # of the ratio that was tried
-            reasons[k] = f"no scale settles: at {1 / ratio:.4g} the surfaces ask for another"
-    unit = seeming_units(ratio).removeprefix("; ")
+            reasons[k] = f"no scale settles: at a scale of {1 / ratio:.4g} the surfaces ask for another"
+    unit = seeming_units(ratio, told_apart(source.name, result.target.name, ratio)).removeprefix("; ")
     origin = float(source.origin[0]), float(source.origin[1]), float(source.origin[2])
     answer = replace(
         result,

@@ -311,7 +311,7 @@ class Search:
         scale = measure_scale(T, shared)
         if scale is not None:  # maps are bent where their scans were joined
             scale = replace(scale, sigma=expert().locating.scale_deviation * scale.sigma)
-        decision = decision.with_scale(scale)
+        decision = decision.with_scale(scale, (pair.clouds[0].name, pair.clouds[1].name))
         told = measure_accuracy(T, shared, pair.matched, pair.inlier_threshold)
         stood = best.decision.judgement.status == "ok"
         return Found(pair, replace(decision, accuracy=told), sure, stood), distinct

@@ -3,11 +3,30 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 
 def counted(number: int, one: str, many: str | None = None) -> str:
     """``1 pair``, ``1,234 pairs``; ``many`` where it is not ``one`` with an s."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def shape_in_words(shape: Sequence[int]) -> str:
+    """What an array of a shape holds: ``a single number``, ``3 numbers``, ``3 rows of 500 numbers``."""
+    if not shape:
+        return "a single number"
+    if len(shape) == 1:
+        return counted(shape[0], "number")
+    if len(shape) == 2:
+        return f"{counted(shape[0], 'row')} of {counted(shape[1], 'number')}"
+    return f"a block of {' x '.join(f'{count:,}' for count in shape)} numbers"
+
+
+def of_the_score(share: float) -> str:
+    """How another transform scores beside the answer, the share of its score given, not below zero."""
+    if share >= 1.005:
+        return f"{share:.3g} times the score"
+    return f"{100 * share:.0f} % of the score" if share >= 0.01 else "under 1 % of the score"
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:

@@ -70,7 +70,7 @@ def _rmse(value: float, unit: str) -> str:
 def _scale(result: RegistrationResult) -> str:
     sigma = result.evidence.get("scale_sigma")
     unsure = "" if sigma is None else f" +- {100 * sigma:.1f} %"
-    return f"{result.scale:.6g}{unsure}: lengths of the target over those of the source"
+    return f"{result.scale:.6g}{unsure}: lengths of the source times this are those of the target"
 
 
 def paragraph(result: RegistrationResult) -> str:

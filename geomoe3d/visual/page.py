@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.runtime.files import check_output, write_text
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, of_the_score
 from geomoe3d.types import FloatArray, IntArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length, margin_facts
 from geomoe3d.visual.drawing import (
@@ -77,6 +77,7 @@ def render_page(view: RegistrationView, *, max_points: int = 50_000, mark: str =
         "tables": {"Numbers": _facts(view), "Time": [(k, f"{s:.3f} s") for k, s in result.seconds.items()]},
         "drawn": _drawn(view, drawing),
         "unit": view.unit,
+        "share": None if result.alternative is None else of_the_score(result.alternative.relative_score),
     }
     return render_cloud_page("visual", "page", values, _data(view, drawing))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, of_the_score
 from geomoe3d.types import BoolArray
 from geomoe3d.visual.accuracy_facts import accuracy_facts, length
 from geomoe3d.visual.drawing import (
@@ -185,8 +185,7 @@ def draw_facts(axes: Axes, view: RegistrationView) -> None:
         facts.append(
             (
                 "alternative",
-                f"{other.rotation_difference_deg:.1f}° and {away} away,\n"
-                f"score {other.relative_score:.2f} of the answer's",
+                f"{other.rotation_difference_deg:.1f}° and {away} away,\n{of_the_score(other.relative_score)}",
             )
         )
     y = 0.95

@@ -8,6 +8,9 @@ code 2 (the input is at fault) and everything else into 1.
 
 from __future__ import annotations
 
+import re
+import struct
+
 
 class GeoMoE3DError(Exception):
     """Base of all errors raised on purpose."""
@@ -71,6 +74,30 @@ class MissingWeightsError(CheckpointError, FileNotFoundError):
 
 class DependencyError(GeoMoE3DError, ImportError):
     """An optional part is not installed; the message gives the command that installs it."""
+
+
+def plain_reason(error: BaseException) -> str:
+    """What a library complains of in a file, without words that only its programmers know."""
+    if isinstance(error, UnicodeError):
+        return "it is no text in UTF-8"
+    if isinstance(error, KeyError):
+        return f"{error} is missing in it"
+    if isinstance(error, (IndexError, EOFError, struct.error)):
+        return "it ends too early, or a number in it is wrong"
+    if isinstance(error, (TypeError, AttributeError)):
+        return "a value in it is of another kind than belongs there"
+    said = " ".join(str(error).split()) or "its content makes no sense"
+    for pattern, words in _IN_WORDS:
+        said = re.sub(pattern, words, said)
+    return said
+
+
+_IN_WORDS = (
+    (r"could not convert string to float: (.+)", r"\1 is no number"),
+    (r"could not convert string (.+) to \w+ at row \d+, column (\d+)\.?", r"\1 in column \2 is no number"),
+    (r"the number of columns changed from (\d+) to (\d+) at .*", r"a row has \2 numbers, those before it \1"),
+)
+"""What numpy and Python say of text that is no table of numbers, and what is said instead."""
 
 
 def cannot_read(error: OSError, message: str) -> InputError:

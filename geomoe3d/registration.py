@@ -238,11 +238,12 @@ def register(
 def _check_guess_is_wanted(config: RegistrationConfig) -> None:
     if config.scale == "estimate":
         raise ConfigError(
-            "a first guess is a rigid transform and says nothing of the scale that is to be estimated (scale: "
-            "estimate); leave one of the two out"
+            "--initial (a first guess) and --estimate-scale (scale: estimate) do not go together: a guess is rigid and "
+            "says nothing of the scale. Leave --initial out, or bring both clouds to one unit and leave "
+            "--estimate-scale out"
         )
     if not config.scoring.scorers:
         raise ConfigError(
-            "a first guess is weighed against the hypotheses by scorers, but scoring.scorers is empty; leave "
-            "one of the two out"
+            "--initial (a first guess) is weighed against what is found by scorers, but scoring.scorers is empty; "
+            "leave --initial out, or name a scorer (--scorer surfaces)"
         )

@@ -184,7 +184,7 @@ def test_what_is_no_assignment_is_refused(text: str) -> None:
 
 
 def test_values_that_are_no_yaml_are_refused() -> None:
-    with pytest.raises(ConfigError, match="not valid YAML"):
+    with pytest.raises(ConfigError, match="the value cannot be read"):
         set_keys({}, ["a=[1"])
 
 
@@ -200,7 +200,11 @@ def test_files_and_assignments_combine(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("- 1\n- 2\n", "holds a list"), ("a: [", "not valid YAML"), ("just words", "holds a str")],
+    [
+        ("- 1\n- 2\n", "holds a list"),
+        ("a: [", "no configuration .YAML."),
+        ("just words", "holds text, expected lines"),
+    ],
 )
 def test_files_that_hold_no_mapping_are_refused(tmp_path, text: str, message: str) -> None:
     path = tmp_path / "bad.yaml"
@@ -215,13 +219,13 @@ def test_files_that_cannot_be_read_are_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match="cannot read"):
         read_yaml(tmp_path)
     (tmp_path / "latin.yaml").write_bytes(b"name: \xff\xfe\xe9")
-    with pytest.raises(ConfigError, match=r"latin.yaml.*not valid YAML"):
+    with pytest.raises(ConfigError, match=r"latin.yaml.*no configuration .YAML."):
         read_yaml(tmp_path / "latin.yaml")
 
 
 def test_only_mappings_build_a_configuration() -> None:
     assert build_config(RegistrationConfig, None) == build_config(RegistrationConfig, {})
-    with pytest.raises(ConfigError, match=r"my place: expected a mapping.*list"):
+    with pytest.raises(ConfigError, match=r"my place: expected sections of .*found a list"):
         build_config(RegistrationConfig, [1], "my place")  # type: ignore[arg-type]
 
 

@@ -42,28 +42,31 @@ def test_pickles_are_not_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "array",
+    ("array", "said"),
     [
-        np.zeros(9),
-        np.zeros((3, 2)),
-        np.zeros((2, 3, 4)),
-        np.zeros((5, 3), complex),
-        np.array([["a", "b", "c"]]),
+        (np.zeros(9), "holds 9 numbers, expected a row for each point with three columns, x y z"),
+        (np.zeros((3, 2)), "holds 3 rows of 2 numbers, expected a row for each point"),
+        (np.zeros((2, 3, 4)), "holds a block of 2 x 3 x 4 numbers"),
+        (np.zeros((5, 3), complex), "holds complex numbers, expected floats or integers"),
+        (np.array([["a", "b", "c"]]), "holds text, expected floats or integers"),
     ],
 )
-def test_numpy_files_of_other_shapes_and_types(tmp_path: Path, array: np.ndarray) -> None:
+def test_numpy_files_of_other_shapes_and_types(tmp_path: Path, array: np.ndarray, said: str) -> None:
     np.save(tmp_path / "a.npy", array)
     np.savez(tmp_path / "a.npz", points=array)
     for name in ("a.npy", "a.npz"):
-        message = fails(tmp_path / name)
-        assert str(array.shape) in message or str(array.dtype) in message
+        assert said in fails(tmp_path / name)
 
 
 def test_npz_without_points_lists_its_keys(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", intrinsics=np.eye(3), depth=np.zeros((4, 4)))
     fails(tmp_path / "a.npz", "keys found: intrinsics, depth", "points", "xyz")
     np.savez(tmp_path / "a.npz", points=small_cloud(5), normals=small_cloud(4))
-    fails(tmp_path / "a.npz", "normals", "(4, 3)", "(5, 3)")
+    fails(
+        tmp_path / "a.npz",
+        "normals",
+        "holds 4 rows of 3 numbers, expected a row of three numbers for each of 5 points",
+    )
     np.savez(tmp_path / "a.npz", **{})
     fails(tmp_path / "a.npz", "keys found: none")
 
@@ -89,7 +92,13 @@ def test_a_cloud_on_its_side_is_refused_as_in_memory(tmp_path: Path, shape: tupl
     np.save(tmp_path / "a.npy", np.ones(shape))
     np.savez(tmp_path / "a.npz", points=np.ones(shape))
     for data, error in (("a.npy", FormatError), ("a.npz", FormatError), (None, InputError)):
-        fails(np.ones(shape) if data is None else tmp_path / data, "pass points.T", str(shape), error=error)
+        given = np.ones(shape) if data is None else tmp_path / data
+        said = (
+            str(shape)
+            if data is None
+            else f"holds 3 rows of {shape[1]} numbers, expected a row for each point"
+        )
+        fails(given, said, "exchange rows and columns (in Python points.T)", error=error)
 
 
 def test_organised_and_structured_arrays(tmp_path: Path) -> None:

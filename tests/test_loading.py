@@ -90,9 +90,9 @@ def test_one_bad_normal_drops_all_normals(tmp_path: Path, bad: float) -> None:
 
 def test_missing_file_and_directory(tmp_path: Path) -> None:
     fails(tmp_path / "none.ply", "there is no file", "none.ply", error=MissingFileError)
-    fails(str(tmp_path), "is a directory", error=InputError)
+    fails(str(tmp_path), "is a folder; give one file", error=InputError)
     (tmp_path / "folder.ply").mkdir()
-    fails(tmp_path / "folder.ply", "is a directory", error=InputError)
+    fails(tmp_path / "folder.ply", "is a folder; give one file", error=InputError)
 
 
 @pytest.mark.parametrize(("name", "nearest"), [("a.plly", ".ply"), ("a.lza", ".laz"), ("a.npzz", ".npz")])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,9 @@ from hypothesis import strategies as st
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.errors import InputError
 from geomoe3d.geometry.se3 import (
+    check_motion,
     inverse,
     is_motion,
     is_rotation,
@@ -135,6 +139,34 @@ def test_rotations_and_motions_are_told_within_a_tolerance() -> None:
         make_transform(2 * R, R[0]),
     ):
         assert not is_motion(broken, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("linear", "said"),
+    [
+        (2.0 * np.eye(3), "it holds a scale of 2; divide"),
+        (-0.001 * np.eye(3), "it holds a scale of 0.001; it also mirrors; divide"),
+        (np.diag([1.0, 1.0, -1.0]), "it mirrors"),
+        (np.diag([1.0, 1.0, 1.2]), "lengths are 1, 1, 1.2, and lengths and angles are off by up to 0.44"),
+        (np.zeros((3, 3)), "lengths are 0, 0, 0"),
+    ],
+)
+def test_what_is_no_rigid_transform_says_why_and_what_to_do(linear: np.ndarray, said: str) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        check_motion(make_transform(linear, np.ones(3)))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (np.eye(3), "found 3 rows of 3 numbers"),
+        (np.full((4, 4), np.nan), "found NaN"),
+        ("no", "no table of numbers"),
+    ],
+)
+def test_what_is_no_matrix_is_told_in_plain_words(given: object, said: str) -> None:
+    with pytest.raises(InputError, match=f"4 rows of 4 finite numbers, .*{said}"):
+        check_motion(given)
 
 
 @given(SEEDS)

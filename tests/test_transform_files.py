@@ -134,8 +134,8 @@ def test_first_guesses_of_other_programs(tmp_path: Path, number: int) -> None:
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("1 2 3 4\n5 6 7 8\n", "shape (2, 4)"),
-        ("hello world", "hello"),
+        ("1 2 3 4\n5 6 7 8\n", "2 rows of 4 numbers; expected 4 rows (or 3) of 4"),
+        ("hello world", "'hello' is no number"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "2 rows"),
         ("1 0 0 0 5 6 7", "the order is tx ty tz"),
         ("{}", "0 transforms"),
@@ -145,7 +145,7 @@ def test_first_guesses_of_other_programs(tmp_path: Path, number: int) -> None:
         ("# static_transform_publisher", "0 rows"),
         ("", "0 rows"),
         ("\0\0\0\0", "no text"),
-        ("[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]", "shape"),
+        ("[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]", "a block of 1 x 1 x"),
     ],
 )
 def test_what_is_no_transform(tmp_path: Path, text: str, word: str) -> None:

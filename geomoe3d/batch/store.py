@@ -128,8 +128,10 @@ class BatchStore:
         differing = {} if stored is None or fresh else differences(stored, self._identity)
         if differing:
             raise InputError(
-                f"'{folder}' holds results of another batch; give another folder, or --fresh (fresh=True) to begin "
-                f"anew. They differ in {in_words(differing)}"
+                f"'{folder}' holds pairs that another configuration or version registered; its answers are not mixed "
+                "with these. The same command with --fresh (fresh=True) registers every pair anew and takes what the "
+                "cache has of the scans; another folder keeps both. They differ in "
+                f"{in_words(differing)}"
             )
 
     def begin(self) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option, use_instead
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, scale_option, worker_options
 from geomoe3d.runtime.words import counted
@@ -48,6 +49,15 @@ def command(context: click.Context, /, pairs: str, out: str, quiet: bool, **give
     interrupted batch continues when it is started again. A file that cannot be read affects its own pairs
     only. Exit code 0 if every pair is ok, 3 if not, 2 for unusable input.
     """
+    if pairs.lower().endswith((".ply", ".pcd", ".las", ".laz", ".e57", ".ptx", ".pts", ".npy", ".npz")):
+        raise use_instead(
+            f"'{pairs}' is a cloud, not a table of pairs; two clouds are registered by `register`",
+            pairs,
+            out,
+            verb="register",
+        )
+    if Path(out).is_file() and not Path(pairs).is_file():
+        raise use_instead("the table of pairs comes first, the folder for the results last", out, pairs)
     from geomoe3d.batch.run import register_pairs
     from geomoe3d.cli.progress import stdout_to_stderr
 

@@ -159,6 +159,19 @@ def _explain(error: Exception, shown: bool) -> int:
     return ExitCode.FAULT
 
 
+def use_instead(said: str, *words: str, verb: str | None = None) -> click.UsageError:
+    """An error that ends in the line to type.
+
+    Args:
+        said: what is wrong.
+        words: arguments of the verb at work, in the right order.
+        verb: another verb in its place.
+    """
+    context = click.get_current_context()
+    command = context.command_path if verb is None else f"{context.find_root().command_path} {verb}"
+    return click.UsageError(f"{said}; write '{command} {shlex.join(words)}'")
+
+
 def renamed(old: str, new: str) -> Callable[[F], F]:
     """Gives a verb the old name of an option, whose use is an error that names the new one."""
 

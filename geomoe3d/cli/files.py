@@ -34,6 +34,11 @@ def part_option(kind: Kind) -> Callable[[Command], Command]:
     )
 
 
+def is_map(name: str) -> bool:
+    """Whether an argument names what `geomoe3d index` writes."""
+    return Path(name).suffix.lower() == ".map"
+
+
 def check_outputs(
     wanted: Iterable[tuple[str, str | None, tuple[str, ...]]], inputs: Iterable[str], force: bool
 ) -> None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from geomoe3d.cli.errors import HELP, Verb, traceback_option
-from geomoe3d.cli.files import part_option
+from geomoe3d.cli.errors import HELP, Verb, traceback_option, use_instead
+from geomoe3d.cli.files import is_map, part_option
 from geomoe3d.cli.parts import configuration_options
 from geomoe3d.runtime.words import counted
 
@@ -43,8 +43,15 @@ def command(
     """
     if len(inputs) < 2:
         raise click.UsageError("give at least one cloud, and OUT.map last")
-    if Path(inputs[-1]).suffix.lower() != ".map":
-        raise click.UsageError(f"the last name is that of the map and ends in .map, found '{inputs[-1]}'")
+    maps = [name for name in inputs[:-1] if is_map(name)]
+    if maps:
+        others = [name for name in inputs if name not in maps]
+        raise use_instead("the map is written and comes last, behind its clouds", *others, maps[-1])
+    if not is_map(inputs[-1]):
+        rule = "the last name is that of the map to write and ends in .map"
+        if Path(inputs[-1]).exists():
+            raise use_instead(f"{rule}, but '{inputs[-1]}' is there", *inputs, "NAME.map")
+        raise use_instead(f"{rule}, found '{inputs[-1]}'", *inputs[:-1], f"{inputs[-1]}.map")
     from geomoe3d.cli.progress import stage_display, stdout_to_stderr
 
     with stdout_to_stderr(), stage_display(quiet) as stage:

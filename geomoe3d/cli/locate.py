@@ -6,14 +6,14 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
 
-from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
-from geomoe3d.cli.files import check_outputs, part_option
+from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option, use_instead
+from geomoe3d.cli.files import check_outputs, is_map, part_option
 from geomoe3d.cli.parts import configuration_options, sensor_place, unit_option
+from geomoe3d.runtime.words import of_the_score
 
 if TYPE_CHECKING:
     from geomoe3d.config import RegistrationConfig
@@ -89,9 +89,12 @@ def command(
     """
     if len(inputs) < 2:
         raise click.UsageError("give at least one scan, and the map last")
-    maps = [name for name in inputs[:-1] if Path(name).suffix.lower() == ".map"]
+    maps = [name for name in inputs[:-1] if is_map(name)]
     if maps:
-        raise click.UsageError(f"'{maps[0]}' is a map: give the scans first and one map last")
+        others = [name for name in inputs if name != maps[0]]
+        if is_map(others[-1]):
+            raise click.UsageError(f"'{maps[0]}' and '{others[-1]}' are maps: give one map, behind the scans")
+        raise use_instead(f"'{maps[0]}' is a map, and the map comes last, behind the scans", *others, maps[0])
     from geomoe3d.cli.progress import stage_display, stdout_to_stderr
 
     with stdout_to_stderr(), stage_display(quiet) as stage:
@@ -108,7 +111,7 @@ def command(
             raise click.UsageError(f"--initial is a guess of one scan, found {len(scans)}")
         guess = None if initial is None else load_transform(initial)
         prior, stood = None if near is None else _numbers(near), sensor_place(sensor, "--sensor")
-        if Path(inputs[-1]).suffix.lower() == ".map":
+        if is_map(inputs[-1]):
             within_map = Map.open(inputs[-1], config=config)
         else:
             within_map = Map.from_cloud(inputs[-1], config=config, progress=stage)
@@ -169,8 +172,9 @@ def _print(name: str, location: Location, form: Form, alone: bool, unit: str) ->
     elif alone:
         click.echo(summary(result, unit=unit), color=False if os.environ.get("NO_COLOR") else None)
         for number, place in enumerate(location.places[1:], start=2):
-            share = f"{100 * place.relative_score:.0f} % of the score"
-            click.echo(f"place {number}: at {_at(place.T_map_scan, unit)}, {share}")
+            click.echo(
+                f"place {number}: at {_at(place.T_map_scan, unit)}, {of_the_score(place.relative_score)}"
+            )
     else:
         reason = f"; {result.reasons[0]}" if result.reasons else ""
         at = "" if location.status == "failed" else f" at {_at(location.T_map_scan, unit)}"

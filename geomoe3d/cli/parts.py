@@ -64,7 +64,7 @@ worker_options = together(
 scale_option = click.option(
     "--estimate-scale",
     is_flag=True,
-    help="Estimate the scale too (1/1000 to 1000): the files may be in different units.",
+    help="Estimate the scale too (1/1000 to 1000): the files may be in different units. Not with a first guess.",
 )
 """Adds ``--estimate-scale``, for verbs with `configuration_options`."""
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, cannot_read
+from geomoe3d.errors import FormatError, cannot_read, plain_reason
+from geomoe3d.runtime.words import shape_in_words
 from geomoe3d.types import FloatArray
 
 
@@ -23,10 +24,13 @@ def load_correspondences(path: str | Path) -> FloatArray:
         found: FloatArray = np.asarray(rows, dtype=np.float64)
     except OSError as error:
         raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
-    except ValueError as error:
-        raise FormatError(f"'{path}' holds no rows of six numbers: {error}") from None
+    except (ValueError, EOFError) as error:
+        raise FormatError(
+            f"'{path}' holds no rows of six numbers (x y z in the source, x y z in the target): {plain_reason(error)}"
+        ) from None
     if found.ndim != 2 or found.shape[1] != 6:
         raise FormatError(
-            f"'{path}' holds an array of shape {found.shape}, expected (N, 6): source x y z, target x y z"
+            f"'{path}' holds {shape_in_words(found.shape)}, expected six numbers a row: x y z in the source, x y z in "
+            "the target"
         )
     return found

@@ -172,7 +172,7 @@ def read_raw(data: Any) -> RawCloud:
     take_inherited()
     try:
         if path.is_dir():
-            raise InputError(f"'{path}' is a directory; pass one file of it")
+            raise InputError(f"'{path}' is a folder; give one file of it (`geomoe3d multiway` takes folders)")
         size = path.stat().st_size
         inner = path.with_suffix("") if path.suffix.lower() == ".gz" else path
         reader = READERS.get(inner.suffix.lower())

@@ -19,14 +19,14 @@ import numpy as np
 from geomoe3d.clouds.transform_formats import (
     TEXTS,
     WITHOUT_SCALE,
-    describe_error,
     matrix_text,
     of_matrix,
     parse_transform,
 )
-from geomoe3d.errors import FormatError, InputError, cannot_read
+from geomoe3d.errors import FormatError, InputError, cannot_read, plain_reason
 from geomoe3d.geometry.se3 import scale_of
 from geomoe3d.runtime.files import write_atomically, write_text
+from geomoe3d.runtime.words import shape_in_words
 from geomoe3d.types import FloatArray
 
 if TYPE_CHECKING:
@@ -194,9 +194,9 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
     except OSError as error:
         raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
     except (ValueError, EOFError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise FormatError(f"'{path}' holds no transform: {describe_error(error)}") from None
+        raise FormatError(f"'{path}' holds no transform: {plain_reason(error)}") from None
     if T.shape != (4, 4):
-        raise FormatError(f"'{path}' holds numbers of shape {T.shape}, expected (4, 4)")
+        raise FormatError(f"'{path}' holds {shape_in_words(T.shape)}, expected 4 rows of 4")
     if not np.isfinite(T).all():
         raise InputError(f"'{path}' holds no transform, its numbers are not finite")
     return T
@@ -210,4 +210,4 @@ def _of_npy(data: bytes) -> FloatArray:
     except FormatError:
         raise
     except Exception as error:  # numpy's header parser has many ways to refuse
-        raise FormatError(f"{type(error).__name__}: {error}") from None
+        raise FormatError(plain_reason(error)) from None

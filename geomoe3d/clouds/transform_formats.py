@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError
-from geomoe3d.runtime.words import counted
+from geomoe3d.errors import FormatError, plain_reason
+from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import FloatArray
 
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -124,7 +124,7 @@ def parse_transform(text: str) -> FloatArray:
     try:
         numbers = [[float(word) for word in row] for row in rows if row]
     except ValueError as error:
-        raise FormatError(str(error)) from None
+        raise FormatError(plain_reason(error)) from None
     return _of_rows(numbers, remarks)
 
 
@@ -142,17 +142,19 @@ def _of_rows(rows: list[list[float]], remarks: str) -> FloatArray:
             f"{counted(shape[0], 'row')} of {counted(shape[1], 'number')}; give a file of one transform"
         )
     what = (
-        f"numbers of shape {shape}"
+        shape_in_words(shape)
         if shape[1]
         else f"{counted(len(rows), 'row')} of {counted(sum(map(len, rows)), 'number')}"
     )
-    raise FormatError(f"{what}; expected (4, 4), (3, 4), or translation and quaternion")
+    raise FormatError(
+        f"{what}; expected 4 rows (or 3) of 4 numbers, or translation and quaternion (7 numbers)"
+    )
 
 
 def of_matrix(values: FloatArray) -> FloatArray:
     """(4, 4) from (4, 4), (3, 4), or these row after row. Raises FormatError: another number of values."""
     if values.size not in (12, 16) or (values.ndim == 2 and values.shape[1] != 4 and values.shape[0] != 1):
-        raise FormatError(f"numbers of shape {values.shape}, expected (4, 4)")
+        raise FormatError(f"{shape_in_words(values.shape)}, expected 4 rows of 4")
     T = np.eye(4)
     T[: values.size // 4] = values.reshape(-1, 4)
     return T
@@ -236,8 +238,3 @@ def _motions(data: Any, depth: int = 0) -> Any:
             return
         for value in data:
             yield from _motions(value, depth + 1)
-
-
-def describe_error(error: Exception) -> str:
-    """A reason for messages, of whatever a text that is no transform leads to."""
-    return f"{error}" if isinstance(error, (InputError, ValueError)) else f"{type(error).__name__}: {error}"

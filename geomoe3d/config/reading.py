@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from geomoe3d.config.section import Section
 from geomoe3d.config.sections import MOVED, RegistrationConfig
-from geomoe3d.errors import ConfigError, MissingConfigError
+from geomoe3d.errors import ConfigError, MissingConfigError, plain_reason
 
 S = TypeVar("S", bound=Section)
 
@@ -54,7 +54,7 @@ def build_config(section: type[S], tree: dict[str, Any] | None, where: str = "co
         ConfigError: an unknown key (names the nearest known one) or a value out of its range.
     """
     if tree is not None and not isinstance(tree, dict):
-        raise ConfigError(f"{where}: expected a mapping of keys to values, found {type(tree).__name__}")
+        raise ConfigError(f"{where}: expected sections of 'key: value', found {_kind(tree)}")
     try:
         return section.model_validate(tree or {})
     except ValidationError as error:
@@ -83,7 +83,7 @@ def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
         try:
             node[leaf] = yaml.safe_load(text)
         except yaml.YAMLError as error:
-            raise ConfigError(f"'{assignment}': the value is not valid YAML ({error})") from None
+            raise ConfigError(f"'{assignment}': the value cannot be read ({plain_reason(error)})") from None
     return result
 
 
@@ -106,14 +106,21 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"cannot read configuration '{path}': {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"'{path}' is not valid YAML: {error}") from None
+        raise ConfigError(f"'{path}' is no configuration (YAML): {plain_reason(error)}") from None
     if twice:
         raise ConfigError(f"'{path}' gives '{twice[0]}' more than once; keep one of them")
     if tree is None:
         return {}
     if not isinstance(tree, dict):
-        raise ConfigError(f"'{path}' holds a {type(tree).__name__}, expected a mapping of keys to values")
+        raise ConfigError(
+            f"'{path}' holds {_kind(tree)}, expected lines of 'key: value' as `geomoe3d config` prints them"
+        )
     return tree
+
+
+def _kind(value: object) -> str:
+    """What YAML that is no mapping holds, in words."""
+    return "a list" if isinstance(value, list) else "text" if isinstance(value, str) else f"'{value}'"
 
 
 def yaml_text(section: Section) -> str:

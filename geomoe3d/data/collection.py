@@ -31,9 +31,9 @@ from geomoe3d.data.threedmatch import (
     read_gt_overlap,
     true_motion,
 )
-from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, MissingFileError
+from geomoe3d.errors import FormatError, GeoMoE3DError, InputError, MissingFileError, plain_reason
 from geomoe3d.geometry.se3 import inverse, make_transform, project_to_so3
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import FloatArray, PointCloud
 
 _CLOUD_PATTERN = "cloud_bin_*.ply"
@@ -140,7 +140,7 @@ def fragment_number(path: Path) -> int:
 def _as_points(value: object, path: Path) -> FloatArray:
     points = np.asarray(value)
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] < 3:
-        raise FormatError(f"'{path}' holds no (N, 3) numbers but {points.dtype} {points.shape}")
+        raise FormatError(f"'{path}' holds no x, y, z for each point but {shape_in_words(points.shape)}")
     return np.asarray(points[:, :3], dtype=np.float64)
 
 
@@ -208,7 +208,7 @@ def _add_by_poses(collection: Collection, folder: Path) -> None:
     try:
         poses = np.loadtxt(path).reshape(-1, 4, 4)
     except (OSError, ValueError) as error:
-        collection.problems.append(f"'{path}' holds no poses of 16 numbers: {error}")
+        collection.problems.append(f"'{path}' holds no poses of 16 numbers: {plain_reason(error)}")
         return
     if len(poses) != len(clouds) or not np.isfinite(poses).all():
         collection.problems.append(
@@ -303,7 +303,7 @@ def _open_predator(collection: Collection) -> None:
             if not all(np.isfinite(values).all() for values in (R, t, overlaps)):
                 raise FormatError("a transform or an overlap is not finite")
         except (GeoMoE3DError, KeyError, TypeError, ValueError) as error:
-            collection.problems.append(f"'{file}' is no list of pairs: {error}")
+            collection.problems.append(f"'{file}' is no list of pairs: {plain_reason(error)}")
             continue
         base = _cloud_base(collection.root, str(names[0][0])) if names else collection.root
         for k, (source, target) in enumerate(names):

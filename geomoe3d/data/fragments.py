@@ -141,7 +141,8 @@ def fuse_run(
                 skipped.append(f"{frame.path.name}: {error}")
                 continue
             if depth.shape != size:
-                skipped.append(f"{frame.path.name}: {depth.shape} pixels, the others have {size}")
+                found, others = (f"{width} x {height}" for height, width in (depth.shape, size))
+                skipped.append(f"{frame.path.name}: {found} pixels, the others have {others}")
                 continue
             share = float(np.mean(depth > 0))
             if share < 0.01:  # of the pixels of a depth image

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geomoe3d.errors import FormatError, InputError, MissingFileError, cannot_read
+from geomoe3d.errors import FormatError, InputError, MissingFileError, cannot_read, plain_reason
 from geomoe3d.geometry.se3 import is_rotation, make_transform, project_to_so3
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import Float32Array, FloatArray
 
 CONVENTIONS = ("7scenes", "tum", "plain")
@@ -114,7 +114,10 @@ def read_depth(recording: Recording, frame: Frame) -> Float32Array:
     except Exception as error:  # Pillow raises OSError, SyntaxError, ValueError and zlib's own
         raise FormatError(f"'{frame.path}' is no readable image: {error}") from None
     if values.ndim != 2 or values.dtype.kind not in "iu" or values.dtype.itemsize < 2:
-        raise FormatError(f"'{frame.path}' is no 16-bit depth image but {values.dtype} {values.shape}")
+        raise FormatError(
+            f"'{frame.path}' is no depth image: expected one channel of 16-bit whole numbers, found "
+            f"{' x '.join(map(str, values.shape))} values of {8 * values.dtype.itemsize} bits"
+        )
     depth: Float32Array = (values / recording.per_metre).astype(np.float32)
     depth[np.isin(values, recording.invalid)] = 0
     return depth
@@ -157,7 +160,7 @@ def _numbers(path: Path) -> NDArray[np.float64]:
     try:
         return np.atleast_2d(np.loadtxt(lines, delimiter="," if "," in lines[0] else None))
     except ValueError as error:
-        raise FormatError(f"'{path}' holds no table of numbers: {error}") from None
+        raise FormatError(f"'{path}' holds no table of numbers: {plain_reason(error)}") from None
 
 
 def _text(path: Path) -> str:
@@ -177,7 +180,9 @@ def _read_intrinsics(folder: Path) -> FloatArray:
                 return np.array(values[:3, :3])
             if values.size in (4, 9):
                 return _matrix(values.ravel())
-            raise FormatError(f"'{path}': expected 3 x 3 or 'fx fy cx cy', found shape {values.shape}")
+            raise FormatError(
+                f"'{path}': expected 3 x 3 or 'fx fy cx cy', found {shape_in_words(values.shape)}"
+            )
     raise InputError(
         f"'{folder}' holds no intrinsics ({', '.join(_INTRINSICS)}); give --intrinsics fx,fy,cx,cy"
     )
@@ -193,7 +198,7 @@ def _matrix(values: FloatArray) -> FloatArray:
 def _check_pose(values: FloatArray, name: str, skipped: list[str]) -> FloatArray | None:
     """The pose with its rotation on SO(3), or None and a sentence why not."""
     if values.shape not in ((4, 4), (3, 4)):
-        skipped.append(f"{name}: the pose has shape {values.shape}, expected (4, 4)")
+        skipped.append(f"{name}: the pose holds {shape_in_words(values.shape)}, expected 4 rows of 4")
         return None
     if not np.isfinite(values).all():
         skipped.append(f"{name}: the pose is not finite")

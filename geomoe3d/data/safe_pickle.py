@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, cannot_read
+from geomoe3d.errors import FormatError, cannot_read, plain_reason
 
 _ALLOWED = {
     ("numpy", "ndarray"): np.ndarray,
@@ -49,7 +49,7 @@ def load_pickle(path: str | Path) -> Any:
     except FormatError as error:
         raise FormatError(f"'{path}': {error}") from None
     except Exception as error:  # a damaged pickle raises nearly anything
-        raise FormatError(f"'{path}' is no readable pickle: {type(error).__name__}: {error}") from None
+        raise FormatError(f"'{path}' is no readable pickle: {plain_reason(error)}") from None
 
 
 def _load_torch_zip(path: Path) -> Any:

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError, cannot_read
+from geomoe3d.errors import FormatError, InputError, cannot_read, plain_reason
 from geomoe3d.geometry.se3 import inverse, is_motion, make_transform, project_to_so3
 from geomoe3d.runtime.files import write_text
+from geomoe3d.runtime.words import shape_in_words
 from geomoe3d.types import FloatArray
 
 BENCHMARKS = ("3DMatch", "3DLoMatch")
@@ -282,11 +283,11 @@ def _read_blocks(path: Path, size: int) -> PairTable:
             matrix = np.array([[float(word) for word in line.split()] for _, line in body])
         except ValueError as error:
             raise FormatError(
-                f"'{path}' line {number}: no entry 'i j count' and {size} rows: {error}"
+                f"'{path}' line {number}: no entry 'i j count' and {size} rows: {plain_reason(error)}"
             ) from None
         if matrix.shape != (size, size):
             raise FormatError(
-                f"'{path}' line {number}: the entry holds a {matrix.shape} block, expected ({size}, {size}); "
+                f"'{path}' line {number}: the entry holds {shape_in_words(matrix.shape)}, expected {size} of {size}; "
                 "is the file cut short?"
             )
         if not np.isfinite(matrix).all():

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import FormatError, InputError, plain_reason
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
 from geomoe3d.runtime.files import make_folder, remove, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
@@ -99,7 +99,7 @@ def read_predictions(folder: Path) -> list[Prediction]:
             prediction = decode(record)
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(
-                f"'{path}' line {number} is no prediction ({error!r}); the file was damaged: remove "
+                f"'{path}' line {number} is no prediction ({plain_reason(error)}); the file was damaged: remove "
                 "that line and predict again, and what it stood for is done again"
             ) from None
         predictions.setdefault(prediction.pair, prediction)

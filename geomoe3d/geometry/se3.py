@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomoe3d.errors import InputError
+from geomoe3d.runtime.words import shape_in_words
 from geomoe3d.types import FloatArray
+
+_WANTED = "a transform must be 4 rows of 4 finite numbers"
 
 
 def make_transform(R: NDArray[np.floating[Any]], t: NDArray[np.floating[Any]]) -> FloatArray:
@@ -107,6 +110,26 @@ def _off_rotation(R: FloatArray) -> float:
     return float(np.abs(R.T @ R - np.eye(3)).max())
 
 
+def _not_rigid(R: FloatArray, tolerance: float) -> str:
+    """Why R (3, 3) is no rotation, and what to do, as the end of a sentence."""
+    det = float(np.linalg.det(R))
+    mirrors = "; it also mirrors" if det < 0 else ""
+    scale = float(np.cbrt(abs(det)))
+    if scale > 0 and _off_rotation(R / scale) <= tolerance and abs(scale - 1) > tolerance / 2:
+        return (
+            f"it holds a scale of {scale:.6g}{mirrors}; divide the first three numbers of its first three rows by "
+            f"{scale:.6g} if all data are in one unit, else bring them to one unit first"
+        )
+    if _off_rotation(R) <= tolerance:
+        return "it mirrors (its determinant is -1); bring both clouds to right-handed axes first"
+    lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(R, axis=0))
+    return (
+        "the first three columns of its first three rows must have the length 1 and stand at right angles; their "
+        f"lengths are {lengths}, and lengths and angles are off by up to {_off_rotation(R):.3g} (at most "
+        f"{tolerance}){mirrors}"
+    )
+
+
 def check_motion(T: ArrayLike) -> FloatArray:
     """A user's matrix as a rigid motion (4, 4), its rotation projected onto SO(3). Raises InputError: another
     shape, non-finite numbers, a last row other than 0 0 0 1, or a linear part that is no rotation: R^T R
@@ -114,22 +137,15 @@ def check_motion(T: ArrayLike) -> FloatArray:
     try:
         matrix = np.array(T, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError("a transform must be a matrix of numbers of shape (4, 4)") from None
+        raise InputError(f"{_WANTED}, found something that is no table of numbers") from None
     if matrix.shape != (4, 4):
-        raise InputError(f"a transform must be 16 finite numbers of shape (4, 4), found shape {matrix.shape}")
+        raise InputError(f"{_WANTED}, found {shape_in_words(matrix.shape)}")
     if not np.isfinite(matrix).all():
-        raise InputError(
-            "a transform must be 16 finite numbers of shape (4, 4), found NaN or infinities in it"
-        )
+        raise InputError(f"{_WANTED}, found NaN or infinities in it")
     R = matrix[:3, :3]
     tolerance = 0.01  # published poses are up to 5e-4 off
     if not is_rotation(R, tolerance):
-        off = _off_rotation(R)
-        what = "mirrors" if off <= tolerance else f"is {off:.3g} off a rotation"
-        raise InputError(
-            f"the matrix is no rigid transform: its linear part {what} (at most {tolerance}); scale and "
-            "shear are not estimated"
-        )
+        raise InputError(f"the matrix is no rigid transform: {_not_rigid(R, tolerance)}")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise InputError(f"the last row of a transform must be 0 0 0 1, found {matrix[3].tolist()}")
     return make_transform(project_to_so3(R), matrix[:3, 3])

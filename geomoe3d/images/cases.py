@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import FormatError, InputError, plain_reason
 from geomoe3d.images.cameras import Camera, View, opencv, rays_of
 from geomoe3d.images.config import KEYPOINTS
 from geomoe3d.images.features import Matches, detect, match, read_grey
@@ -64,7 +64,7 @@ def read_pair_list(file: Path, root: Path | None = None) -> list[ViewPair]:
         rows = np.loadtxt(file, dtype=str, ndmin=2)
         numbers = rows[:, 4:].astype(np.float64)
     except ValueError as error:
-        raise FormatError(f"'{file}' is no list of pairs: {error}") from None
+        raise FormatError(f"'{file}' is no list of pairs: {plain_reason(error)}") from None
     if rows.shape[1] != 38:
         raise FormatError(f"'{file}' has {rows.shape[1]} words a line; a pair has 38")
     pairs = []
@@ -130,7 +130,7 @@ def _numbers(file: Path, columns: int) -> FloatArray:
     try:
         rows: FloatArray = np.loadtxt(file, ndmin=2)
     except (OSError, ValueError) as error:
-        raise FormatError(f"'{file}' cannot be read: {error}") from None
+        raise FormatError(f"'{file}' cannot be read: {plain_reason(error)}") from None
     if rows.shape[1] < columns:
         raise FormatError(f"'{file}' has {rows.shape[1]} numbers a line; at least {columns} are needed")
     return rows

@@ -21,7 +21,7 @@ from geomoe3d.geometry.se3 import check_motion, inverse, make_transform
 from geomoe3d.images.cameras import Camera, ImageScene, View
 from geomoe3d.images.features import read_grey
 from geomoe3d.runtime.optional import optional_module
-from geomoe3d.runtime.words import counted, natural_key
+from geomoe3d.runtime.words import counted, natural_key, shape_in_words
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".tif", ".tiff")
 
@@ -100,7 +100,9 @@ def _transforms(folder: Path, file: Path) -> Iterator[View]:
 def _llff(folder: Path, file: Path) -> Iterator[View]:
     rows = np.load(file, allow_pickle=False)
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise FormatError(f"'{file}' must have shape (N, 17), found {rows.shape}")
+        raise FormatError(
+            f"'{file}' must hold 17 numbers for each photograph, found {shape_in_words(rows.shape)}"
+        )
     images = sorted(images_in(folder / "images"))  # 10 before 2, as LLFF counts
     if len(images) != len(rows):
         found = f"but '{folder / 'images'}' has {counted(len(images), 'image')}"

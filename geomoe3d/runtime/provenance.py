@@ -53,11 +53,14 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
+_NONE = "none"  # a value that only one of two identities has
+
+
 def differences(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, tuple[str, str]]:
-    """What differs between two identities (nested plain JSON): name -> (there, now), as JSON or ``absent``."""
+    """What differs between two identities (nested plain JSON): name -> (there, now), as JSON or ``none``."""
     old, new = _flat(stored), _flat(wanted)
     return {
-        key: (old.get(key, "absent"), new.get(key, "absent"))
+        key: (old.get(key, _NONE), new.get(key, _NONE))
         for key in sorted(old.keys() | new.keys())
         if old.get(key) != new.get(key)
     }
@@ -70,7 +73,7 @@ def in_words(differing: dict[str, tuple[str, str]], most: int = 3, longest: int 
     """
 
     def rank(key: str) -> tuple[bool, bool]:
-        return "absent" in differing[key], max(map(len, differing[key])) > longest
+        return _NONE in differing[key], max(map(len, differing[key])) > longest
 
     first = sorted(differing, key=rank)[:most]
     told = [key if rank(key)[1] else "{} ({} there, {} now)".format(key, *differing[key]) for key in first]

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.formats.raw import RawCloud, cloud_of, columns_by_name, scale_colors, split_columns
 from geomoe3d.clouds.formats.registry import reader, writer
-from geomoe3d.errors import FormatError, InputError
+from geomoe3d.errors import FormatError, InputError, plain_reason
+from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import FloatArray
 
 _POINT_KEYS = (
@@ -21,7 +22,9 @@ _POINT_KEYS = (
 )
 _NORMAL_KEYS = ("normals", "normal", "nrm")
 _COLOR_KEYS = ("colors", "color", "colours", "colour", "rgb")
-_PICKLED = "holds pickled Python objects, which are not loaded; save a plain float array of shape (N, 3)"
+_PICKLED = (
+    "holds pickled Python objects, which are not loaded; save the coordinates as a plain array of floats"
+)
 
 _TOO_LARGE = "describes more numbers than memory holds: its header is wrong, or the machine too small"
 
@@ -95,8 +98,8 @@ def read_npz(path: Path) -> RawCloud:
     for key, extra in zip(wanted[1:], (normals, colors), strict=True):
         if extra is not None and (extra.shape != (len(cloud.points), 3) or extra.dtype.kind not in "fiu"):
             raise FormatError(
-                f"'{path}' key '{key}' has shape {extra.shape} and type {extra.dtype}, "
-                f"expected numbers of shape ({len(cloud.points)}, 3)"
+                f"'{path}' key '{key}' holds {shape_in_words(extra.shape)}, expected a row of three numbers for each "
+                f"of {counted(len(cloud.points), 'point')}"
             )
     return RawCloud(
         cloud.points,
@@ -107,6 +110,10 @@ def read_npz(path: Path) -> RawCloud:
     )
 
 
+_KINDS = {
+    **dict.fromkeys("US", "text"),
+    **{"O": "Python objects", "b": "true and false", "c": "complex numbers", "M": "dates", "m": "times"},
+}
 _KEY_GROUPS = (_POINT_KEYS, _NORMAL_KEYS, _COLOR_KEYS)
 
 
@@ -116,7 +123,7 @@ def _numpy_reason(error: BaseException) -> str:
         return _PICKLED
     if isinstance(error, zipfile.BadZipFile):
         return f"is no NPZ archive or truncated ({text})"
-    return f"is no numpy file or truncated ({text})"
+    return f"is no numpy file or truncated ({plain_reason(error)})"
 
 
 def table_cloud(
@@ -136,9 +143,14 @@ def table_cloud(
     if array.dtype.names is not None:
         return _structured(array.ravel(), what, error)
     if array.dtype.kind not in "fiu":
+        found = _KINDS.get(array.dtype.kind, "no numbers") if columns else array.dtype
         raise error(
-            f"{what} holds {array.dtype}, expected floats or integers; convert with "
-            "numpy.asarray(points, dtype=float) if they are real numbers"
+            f"{what} holds {found}, expected floats or integers"
+            + (
+                ""
+                if columns
+                else "; convert with numpy.asarray(points, dtype=float) if they are real numbers"
+            )
         )
     grid: tuple[str, ...] = ()
     if array.ndim == 3 and array.shape[2] == 3:
@@ -146,8 +158,12 @@ def table_cloud(
         array = array.reshape(-1, 3)
     fits = array.ndim == 2 and (array.shape[1] == 3 or (columns and array.shape[1] > 3))
     if not fits or (array.shape[0] == 3 and array.shape[1] > 3):
-        wanted = "(N, 3), (H, W, 3) or more columns behind x, y and z" if columns else "(N, 3) or (H, W, 3)"
-        raise error(f"{what} has shape {array.shape}, expected {wanted}{_shape_hint(array)}")
+        if columns:  # of a file, whose user need not know Python
+            found = f"{what} holds {shape_in_words(array.shape)}"
+            wanted = "a row for each point with three columns, x y z (more columns may follow)"
+        else:
+            found, wanted = f"{what} has shape {array.shape}", "(N, 3) or (H, W, 3)"
+        raise error(f"{found}, expected {wanted}{_shape_hint(array)}")
     table: FloatArray = np.array(array, dtype=np.float64, order="C")
     if array.shape[1] == 3:
         return RawCloud(table, unread=grid)
@@ -157,9 +173,9 @@ def table_cloud(
 
 def _shape_hint(array: NDArray[Any]) -> str:
     if array.shape == (3,):
-        return "; a single point is points[None]"
+        return "; a single point is a table of one row: points[None]"
     if array.ndim == 2 and array.shape[0] == 3:
-        return "; pass points.T if each column is a point"
+        return "; if each column is a point, exchange rows and columns (in Python points.T)"
     if array.ndim == 2 and array.shape[1] > 3:
         return (
             "; pass points[:, :3] for the coordinates alone, or an .npz file or a geomoe3d.types.PointCloud "

@@ -16,7 +16,7 @@ import numpy as np
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.registry import reader, writer
-from geomoe3d.errors import FormatError
+from geomoe3d.errors import FormatError, plain_reason
 from geomoe3d.runtime.optional import optional_module
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
@@ -81,8 +81,8 @@ def read_scans(path: Path) -> Iterator[RawCloud]:
     except FormatError:
         raise
     except Exception as error:
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise FormatError(f"'{path}' is no E57 file or damaged: {reason[0]}") from None
+        reason = (str(error).strip().splitlines() or [plain_reason(error)])[0]
+        raise FormatError(f"'{path}' is no E57 file or damaged: {reason}") from None
 
 
 def _check_size(path: Path) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.registry import reader
-from geomoe3d.errors import EmptyCloudError, FormatError
+from geomoe3d.errors import EmptyCloudError, FormatError, plain_reason
 from geomoe3d.geometry.se3 import transform_points
 from geomoe3d.types import FloatArray, IntArray
 
@@ -42,7 +42,7 @@ def read_gltf(path: Path) -> RawCloud:
     except (FormatError, EmptyCloudError, OSError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged document leads to: missing keys, wrong types, no numbers
-        raise FormatError(f"'{path}' is damaged: {type(error).__name__}: {error}") from None
+        raise FormatError(f"'{path}' is damaged: {plain_reason(error)}") from None
 
 
 def _read(path: Path) -> RawCloud:

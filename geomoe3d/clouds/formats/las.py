@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.clouds.formats.raw import RawCloud, columns_by_name, scale_colors, wrong_count
 from geomoe3d.clouds.formats.registry import reader, writer
-from geomoe3d.errors import DependencyError, FormatError, InputError
+from geomoe3d.errors import DependencyError, FormatError, InputError, plain_reason
 from geomoe3d.runtime.optional import optional_module
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
@@ -81,7 +81,7 @@ def _opened(path: Path) -> Iterator[Any]:
     except BaseException as error:  # lazrs may panic on damaged data, which is no Exception
         if isinstance(error, (KeyboardInterrupt, SystemExit, MemoryError, GeneratorExit)):
             raise
-        raise FormatError(f"'{path}' is no LAS file or damaged: {error}") from None
+        raise FormatError(f"'{path}' is no LAS file or damaged: {plain_reason(error)}") from None
 
 
 def _cloud(las: Any) -> RawCloud:
@@ -116,7 +116,9 @@ def _check_records(path: Path) -> None:
     with path.open("rb") as handle:
         head = handle.read(375)
     if len(head) < 227 or head[:4] != b"LASF":
-        raise FormatError(f"'{path}' is no LAS file or truncated: {size} bytes, starting with {head[:4]!r}")
+        raise FormatError(
+            f"'{path}' is no LAS file or truncated: it has {size:,} bytes and does not begin with LASF"
+        )
     header_size, first, num_records = struct.unpack("<HII", head[94:104])
     if first > size:
         raise FormatError(f"'{path}': the points begin at byte {first}, the file holds {size}; truncated")

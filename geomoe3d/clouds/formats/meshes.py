@@ -21,9 +21,9 @@ import numpy as np
 from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.registry import reader
 from geomoe3d.clouds.recentre import choose_origin
-from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError
+from geomoe3d.errors import EmptyCloudError, FormatError, GeoMoE3DError, InputError, plain_reason
 from geomoe3d.geometry.se3 import transform_points
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import BoolArray, FloatArray, IntArray
 
 
@@ -55,7 +55,7 @@ def _as_format_errors(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         kind = path.suffix[1:].upper()
-        raise FormatError(f"'{path}' cannot be read as {kind}: {type(error).__name__}: {error}") from None
+        raise FormatError(f"'{path}' cannot be read as {kind}: {plain_reason(error)}") from None
     finally:
         log.setLevel(level)
 
@@ -167,7 +167,9 @@ def flatten(geometry: Any, what: str = "the trimesh object") -> RawCloud:
     for item, T in placed(geometry):
         vertices = np.array(item.vertices, dtype=np.float64)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise FormatError(f"{what}: the vertices have shape {vertices.shape}, expected (N, 3)")
+            raise FormatError(
+                f"{what}: the vertices are {shape_in_words(vertices.shape)}, expected x, y, z of each"
+            )
         if not np.array_equal(T, np.eye(4)):  # keeps unmoved vertices exact
             vertices = transform_points(T, vertices)
         faces = (

@@ -29,6 +29,7 @@ _KINDS = {
     "compressed LAS; its name should end with .laz, or .copc.laz": ".copc .laszip .lasz",
     "pickled Python, which can run anything and is not read; save an array as .npy": ".pkl .pickle .pth .pt",
     "a container of arrays; save the points as .npy": ".h5 .hdf5 .mat .parquet .feather .zarr .nc",
+    "a map of `geomoe3d index`, in which `geomoe3d locate SCAN MAP` finds scans; clouds here": ".map",
     "a transform or settings; clouds come first": ".json .yaml .yml .toml .xml .tum .kitti",
 }
 MEANT = {what: tuple(suffixes.split()) for what, suffixes in _KINDS.items()}

@@ -127,7 +127,7 @@ def test_json_and_inverse_keep_it_and_old_results_have_none() -> None:
 
 def test_the_words_name_each_figure() -> None:
     facts = dict(accuracy_facts(replace(room_view().result, accuracy=FOUND)))
-    assert facts["overlap"] == "60% of the source, 40% of the target"
+    assert facts["overlap"] == "60 % of the source, 40 % of the target"
     assert facts["inlier RMSE"] == "0.03"
     assert facts["distance"] == "mean 0.01, median 0.008, standard deviation 0.007, 95 % within 0.025"
     assert "4 and 12 mm if the unit is the metre" in facts["uncertainty"]
@@ -142,7 +142,7 @@ def test_the_words_name_each_figure() -> None:
         accuracy_facts(replace(room_view().result, accuracy=replace(FOUND, inlier_rmse=float("nan"))))
     )
     assert none["inlier RMSE"] == "none: no correspondence is an inlier"
-    assert dict(accuracy_facts(room_view().result)) == {"overlap": "60% of the source"}
+    assert dict(accuracy_facts(room_view().result)) == {"overlap": "60 % of the source"}
 
 
 @pytest.mark.parametrize(
@@ -171,9 +171,9 @@ def test_what_a_second_grid_gave_stands_on_the_console_and_on_the_page(agree: fl
 
 def test_the_paragraph_and_the_figures_name_one_overlap() -> None:
     result = replace(room_view().result, accuracy=replace(FOUND, overlap_source=0.667), overlap=0.6787)
-    assert dict(accuracy_facts(result))["overlap"].startswith("67% of the source")
-    assert "67% of the source lies on the target" in repr(result)
-    assert "68% of the source lies on the target" in repr(replace(result, accuracy=None))
+    assert dict(accuracy_facts(result))["overlap"].startswith("67 % of the source")
+    assert "67 % of the source lies on the target" in repr(result)
+    assert "68 % of the source lies on the target" in repr(replace(result, accuracy=None))
 
 
 def test_the_picture_tells_inliers_from_outliers_whatever_a_filter_kept() -> None:

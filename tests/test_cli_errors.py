@@ -94,3 +94,19 @@ def test_a_guess_beside_an_unknown_scale_names_both_options(tmp_path, capsys):
     assert (
         "no rigid transform: it holds a scale of 2; divide the first three numbers" in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--voxel-size", "10cm", "--voxel-size = '10cm': it must be a number"),
+        ("--voxel-size", "-1", "--voxel-size = -1: it must be greater than 0"),
+        ("--seed", "x", "--seed = 'x': it must be a whole number"),
+        ("--set", "voxel_size=10cm", "configuration: 'voxel_size' = '10cm': it must be a number"),
+    ],
+)
+def test_a_value_that_cannot_be_is_told_by_the_name_under_which_it_was_given(
+    option, value, said, scan_files, capsys
+):
+    assert call("register", *scan_files, option, value) == 2
+    assert said in capsys.readouterr().err

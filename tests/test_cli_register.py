@@ -31,6 +31,7 @@ def test_every_status_but_ok_ends_with_3_and_still_gives_the_transform(
     assert printed.startswith(status.replace("_", " ") + ": ")
     assert "The clouds share too little." in printed
     assert matrix_text(TRUTH) in printed
+    assert ("\nnext: look at it" in printed) == (status != "failed")
 
 
 def test_summary_tells_everything_and_is_plain_where_nobody_sees_colours(scan_files, fake_registrar, capsys):
@@ -44,7 +45,7 @@ def test_summary_tells_everything_and_is_plain_where_nobody_sees_colours(scan_fi
     assert first == "ok: the transform is reliable (confidence 0.97)"
     for part in (
         "Mostly one plane.",
-        "56% of the source",
+        "56 % of the source",
         "1,234 of 4,321 correspondences within 0.11",
         "0.055 (chosen from the clouds",
         "source.xyz: 81,234 points in, 4,900 voxel points used; "

@@ -104,7 +104,9 @@ def _card(row: PairRow, outcome: Outcome, image: str, blank: str, pages: Abstrac
         "blank": blank,
         "status": outcome.status,
         "word": _word(outcome.status),
-        "numbers": f" confidence {result.confidence:.3f}, overlap {result.overlap:.0%}" if result else "",
+        "numbers": f" confidence {result.confidence:.3f}, overlap {100 * result.overlap:.0f} %"
+        if result
+        else "",
         "id": outcome.id,
         "source": Path(row.source).name,
         "target": Path(row.target).name,

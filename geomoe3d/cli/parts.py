@@ -139,11 +139,19 @@ A part is a name or a class of the user's own, ``file.py:Class`` or ``module:Cla
 
 def _configure(named: dict[str, Any]) -> None:
     from geomoe3d.config import load_config
+    from geomoe3d.errors import ConfigError
 
     settings = [(key, named.pop(key)) for key in ("voxel_size", "seed")]
     settings.append(("scale", "estimate" if named.pop("estimate_scale", False) else None))
     chosen = [f"{key}={value}" for key, value in settings if value is not None]
-    named["config"] = load_config(named.pop("config_file"), [*named.pop("assignments"), *chosen])
+    try:
+        named["config"] = load_config(named.pop("config_file"), [*named.pop("assignments"), *chosen])
+    except ConfigError as error:  # by the name under which it was given
+        said = str(error)
+        for key, value in settings:
+            if value is not None:
+                said = said.replace(f"configuration: '{key}'", f"--{key.replace('_', '-')}")
+        raise type(error)(said) from None
 
 
 configuration_options = together(

@@ -164,6 +164,15 @@ def command(
     context.exit(0 if result.ok else ExitCode.NOT_SURE)
 
 
+_NEXT = {
+    "low_confidence": "look at it with --page FILE.html before you use it; scans that share more, or a first guess "
+    "(--initial FILE), can make it sure",
+    "ambiguous": "look at it and at the other transform with --page FILE.html; a first guess (--initial FILE), or "
+    "scans that see more, can tell the two apart",
+}
+"""What to do, by status, where the reasons do not say it."""
+
+
 def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: bool, unit: str) -> None:
     if as_json:
         click.echo(answer.to_json())
@@ -176,6 +185,8 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
 
         color = False if os.environ.get("NO_COLOR") else None
         click.echo(summary(answer, inverted, unit), color=color)
+        if answer.has_transform and answer.status in _NEXT:
+            click.echo(f"\nnext: {_NEXT[answer.status]}")
 
 
 def _check_outputs(outputs: _Outputs, inputs: Sequence[str], scale: float | None, force: bool) -> None:

@@ -181,4 +181,8 @@ def _nearest(key: str, keys: list[str]) -> str:
     if not close:  # the leaf alone often matches where the section was forgotten
         leaves = {name.rsplit(".", 1)[-1]: name for name in keys}
         close = [leaves[m] for m in difflib.get_close_matches(key.rsplit(".", 1)[-1], list(leaves), n=1)]
-    return f"did you mean '{close[0]}'?" if close else "known keys: " + ", ".join(keys)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    usual = [name for name in keys if not name.startswith("expert.")]
+    more = "" if len(usual) == len(keys) else "; `geomoe3d config --all` lists those of experts too"
+    return f"known keys: {', '.join(usual)}{more}"

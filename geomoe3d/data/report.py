@@ -31,7 +31,7 @@ def report_text(report: SynthesisReport) -> str:
     ]
     for low, high in pairwise((0.0, *BANDS)):
         count = int(((overlaps >= low) & (overlaps < high)).sum())
-        lines.append(f"  - overlap {low:.0%} to {min(high, 1):.0%}: {counted(count, 'pair')}")
+        lines.append(f"  - overlap {100 * low:.0f} % to {100 * min(high, 1):.0f} %: {counted(count, 'pair')}")
     few = [str(scene.number) for scene in report.scenes if scene.num_pairs == 0]
     if few:
         lines.append(f"- scenes without a pair: {', '.join(few)}")

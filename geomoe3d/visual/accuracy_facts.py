@@ -22,17 +22,22 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
     found = result.accuracy
     facts = [] if result.scale == 1.0 else [("scale", _scale(result))]
     if found is None:
-        overlap = f"{result.overlap:.0%} of the source" if np.isfinite(result.overlap) else "not known"
+        overlap = (
+            f"{100 * result.overlap:.0f} % of the source" if np.isfinite(result.overlap) else "not known"
+        )
         return [*facts, ("overlap", overlap)]
     near, far = found.sigma_center, found.sigma_farthest
     guess = "" if unit else " if the unit is the metre"
     # Fewer than a thousandth of a millimetre no scanner measures, so the unit is no metre; a whole metre says more.
     small = 1000.0 * near >= 1e-3 and far < 1
     metres = f" ({near * 1000.0:.3g} and {far * 1000.0:.3g} mm{guess})" if small else ""
-    held = "one deviation" if result.ok else "one deviation, if the answer is right"
+    held = "one standard deviation" if result.ok else "one standard deviation, if the answer is right"
     return [
         *facts,
-        ("overlap", f"{found.overlap_source:.0%} of the source, {found.overlap_target:.0%} of the target"),
+        (
+            "overlap",
+            f"{100 * found.overlap_source:.0f} % of the source, {100 * found.overlap_target:.0f} % of the target",
+        ),
         ("inlier RMSE", _rmse(found.inlier_rmse, unit)),
         (
             "distance",
@@ -91,7 +96,7 @@ def paragraph(result: RegistrationResult) -> str:
         words += f" and shifted by {step:.3g}"
     overlap = result.overlap if result.accuracy is None else result.accuracy.overlap_source
     words += (
-        f"; {overlap:.0%} of the source lies on the target, {result.num_inliers:,} of "
+        f"; {100 * overlap:.0f} % of the source lies on the target, {result.num_inliers:,} of "
         f"{counted(result.num_correspondences, 'correspondence')} agree within {result.inlier_threshold:.3g}"
     )
     if result.ok and (found := result.accuracy) is not None:

@@ -140,7 +140,7 @@ def _draw_distances(axes: Axes, view: RegistrationView, drawing: Drawing, motion
     axes.set_title("Distances after alignment", loc="left", fontsize=9, fontweight="bold", color=INK)
     axes.set_xlabel(
         f"distance of a source point to the nearest target point ({view.unit or 'unit of the files'}); "
-        f"{share:.0%} of the source points have one within {length(limit, view.unit, '.3g')}",
+        f"{100 * share:.0f} % of the source points have one within {length(limit, view.unit, '.3g')}",
         fontsize=7.5,
         color=SOFT,
     )

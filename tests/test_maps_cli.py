@@ -81,7 +81,7 @@ def test_what_is_no_map_is_never_overwritten(tmp_path, monkeypatch, capfd):
     for name in ("one.npy", "two.npy"):
         np.save(name, cloud)
     assert ask("index", "one.npy", "two.npy", "--fresh") == ExitCode.BAD_INPUT
-    assert "ends in .map, found 'two.npy'" in capfd.readouterr().err
+    assert "ends in .map, but 'two.npy' is there; write" in capfd.readouterr().err
     np.testing.assert_array_equal(np.load("two.npy"), cloud)
     assert ask("locate", "house.map", "one.npy") == ExitCode.BAD_INPUT
     assert "'house.map' is a map" in capfd.readouterr().err

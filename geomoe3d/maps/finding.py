@@ -106,7 +106,9 @@ class Finder:
                     known = list(fits)
                 if best is not None and best.decision.answer is not None:
                     known.append(best.decision.T_target_source)
-                most = expert().detail.around_points if fits else expert().maps.around_points
+                most = expert().maps.around_points
+                if fits:
+                    most = min(most, int(times * expert().detail.around_points))
                 level = self._around(search, known, own, most)
             else:
                 level = search.level

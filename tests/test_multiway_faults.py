@@ -14,6 +14,7 @@ from geomoe3d.batch.folder import RUN_FILE
 from geomoe3d.batch.store import Outcome
 from geomoe3d.config import load_config
 from geomoe3d.config.expert import in_force
+from geomoe3d.errors import OutputError
 from geomoe3d.multiway.edges import Edge
 from geomoe3d.multiway.faults import (
     find_faults,
@@ -62,7 +63,7 @@ def test_a_mirrored_scan_and_one_in_millimetres_are_named(tmp_path):
         run.write_text(json.dumps({**data, "created": "of old"}))
         register_scans(files, tmp_path / "model", config=other, page=False, rounds=0, fresh=fresh)
         assert (json.loads(run.read_text())["created"] == "of old") != fresh
-    for fresh in (False, True):  # damaged ones cost no model
+    for fresh in (False, True):  # damaged ones cost neither the model nor what is known of its scans
         run.write_text("{")
         (tmp_path / "model" / "poses.json").unlink()
         for rest in (tmp_path / "model").glob("group1.*"):
@@ -72,9 +73,28 @@ def test_a_mirrored_scan_and_one_in_millimetres_are_named(tmp_path):
             files, tmp_path / "model", config=other, page=False, rounds=0, fresh=fresh, say=said.append
         )
         assert set(last.unplaced) == {"scan_1"}
+        assert last.unplaced["scan_1"].startswith("mirrored: 2 of 2 pairs")
         assert (tmp_path / "model" / "poses.json").is_file()
         assert run.read_text() == "{"
-        assert any("could not be looked at again" in one and "run.json" in one for one in said)
+        assert any("looked at again and not kept" in one and "run.json" in one for one in said)
+
+
+def test_scans_that_could_not_be_looked_at_again_are_doubted():
+    def fail(*_):
+        raise OutputError("no room is left")
+
+    scans = [SimpleNamespace(name=f"scan_{k}") for k in range(3)]
+    similarity = np.ones((3, 3))
+    survey = SimpleNamespace(
+        scans=scans, say=lambda text: None, register_apart=fail, config=load_config(None, SETTINGS),
+        usable=lambda: [0, 1, 2], similarity=similarity, outcomes={},
+    )  # fmt: skip
+    edges = [edge(0, 1, 0.999), edge(2, 1, 0.9)]
+    group = Group({k: np.eye(4) for k in range(3)}, edges)
+    found = find_faults(survey, [group], edges)
+    assert set(found) == {2}
+    assert found[2].startswith("not asked about mirrored axes and units")
+    assert "no room is left" in found[2]
 
 
 def test_parts_are_what_pairs_tie_that_are_too_sure_to_be_asked():

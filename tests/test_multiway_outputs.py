@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from small_scans import SETTINGS, UTM
 
 from geomoe3d import register_scans
+from geomoe3d.batch.folder import short_transform_name
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.clouds.transform_files import load_transform
@@ -23,6 +25,7 @@ from geomoe3d.multiway.formats import tum_text
 from geomoe3d.multiway.free_space import FreeSpace, told_by
 from geomoe3d.multiway.initial import read_poses
 from geomoe3d.multiway.loops import find_loops
+from geomoe3d.multiway.report import contradicted_steps
 
 CONFIG = load_config(None, SETTINGS)
 
@@ -142,7 +145,10 @@ def test_poses_are_read_as_they_were_written(tmp_path, kind):
         ("1 2 3\n", "TUM hold 8, all of KITTI 12"),
         ("0 0 0 0 0 0 0 1\n", "1 pose for 2 scans"),
         ('{"a": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "no pose for 'b'"),
-        ("[[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]],[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]", "rot"),
+        (
+            "[[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]],[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]",
+            "a scale of 2",
+        ),
     ],
 )
 def test_poses_that_cannot_be_used_are_refused(tmp_path, text, message):
@@ -175,6 +181,46 @@ def test_given_poses_place_scans_that_follow_each_other(scanned_room, tmp_path):
     for name in names:
         expected = transform_points(inverse(truth["scan_0"]) @ truth[name], points)
         assert np.abs(transform_points(group.poses[name], points + UTM) - UTM - expected).max() < 0.05
+
+
+def test_wrong_initial_poses_are_no_repeated_structure_and_are_named(scanned_room, tmp_path):
+    folder, _ = scanned_room
+    files = [folder / f"scan_{k}.npy" for k in range(3)]
+    far = [make_transform(np.eye(3), np.array([50.0 * k, 0, 0])).tolist() for k in range(3)]
+    (tmp_path / "given.json").write_text(json.dumps(far))
+    said: list[str] = []
+    model = register_scans(
+        files, tmp_path / "m", config=CONFIG, page=False, initial=tmp_path / "given.json", say=said.append
+    )
+    assert not any(group.repeated for group in model.groups)
+    assert any("the initial poses contradict the scans: 2 of their 2 steps" in one for one in said)
+    steps = [edge for edge in model.edges if edge.given]
+    assert {edge.fate for edge in steps} == {"rejected"}
+    assert all(edge.reason.startswith("as the initial poses have it: ") for edge in steps)
+    assert contradicted_steps([edge for edge in model.edges if not edge.given]) == ""
+
+
+def test_names_too_long_for_a_file_are_shortened_to_different_ones():
+    names = ["点" * 30 + end for end in "ab"]
+    files = [short_transform_name(name) for name in names]
+    assert len(set(files)) == 2
+    assert all(len(file) <= 255 and file.startswith("%E7%82%B9%E7%82%B9") for file in files)
+    assert {unquote(file.split("~")[0], errors="strict") for file in files} == {"点" * 16}
+    assert short_transform_name("scan 1") == "scan 1.txt"
+
+
+def test_files_in_another_unit_than_the_earlier_model_are_told_of_its_grid(scanned_room, tmp_path):
+    folder, _ = scanned_room
+    for k in range(2):
+        np.save(tmp_path / f"s{k}.npy", 1000 * np.load(folder / f"scan_{k}.npy"))
+    config = CONFIG.model_copy(update={"voxel_size": None})
+    register_scans(
+        [tmp_path / "s0.npy", tmp_path / "s1.npy"], tmp_path / "m", config=config, page=False, rounds=0
+    )
+    for k in range(2):
+        np.save(tmp_path / f"s{k}.npy", np.load(folder / f"scan_{k}.npy"))
+    with pytest.raises(InputError, match=r"is that of the earlier model in .*--fresh"):
+        register_scans([tmp_path / "s0.npy", tmp_path / "s1.npy"], tmp_path / "m", config=config, page=False)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,16 @@ def test_scans_are_found_in_natural_order_with_unique_names(tmp_path):
     assert [s.name for s in find_scans([tmp_path / "a", tmp_path / "b"])] == ["a/s9", "a/s10", "b/s9"]
 
 
+def test_files_that_differ_by_their_suffix_keep_it_and_the_others_their_names(tmp_path):
+    for name in ("s 1.ply", "s 1.xyz", "s 2.ply", "t.ply", "t.xyz", "t.ply.xyz"):
+        (tmp_path / name).write_text("")
+    assert [s.name for s in find_scans([tmp_path / f"s {k}" for k in ("1.ply", "1.xyz", "2.ply")])] == [
+        "s 1.ply", "s 1.xyz", "s 2",
+    ]  # fmt: skip
+    found = find_scans([tmp_path / f"t{suffix}" for suffix in (".ply", ".xyz", ".ply.xyz")])
+    assert len({s.name for s in found}) == 3
+
+
 def test_transforms_beside_the_scans_are_no_scans(tmp_path):
     write_sample_pair(tmp_path)
     assert (tmp_path / "T_target_source.txt").is_file()

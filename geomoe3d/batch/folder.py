@@ -6,6 +6,7 @@ not a batch's own is never replaced nor removed: it is refused before work begin
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Callable, Iterable
@@ -104,11 +105,9 @@ def _check_files(place: Path, names: dict[str, str], is_own: Callable[[Path], bo
     if place.exists() and not place.is_dir():
         raise InputError(f"{foreign(place)}, {what}")
     for name, file in names.items():
-        length = len(file.encode())
-        longest = 255  # bytes, of nearly every file system
-        if length > longest:
+        if not _fits(file):
             raise InputError(
-                f"the id '{name}' makes a file name of {counted(length, 'byte')}, at most {longest} are "
+                f"the id '{name}' makes a file name of {counted(len(file.encode()), 'byte')}, at most 255 are "
                 f"possible; give shorter ones in the column id, {what}"
             )
         path = place / file
@@ -147,6 +146,21 @@ def remove_batch(folder: Path) -> None:
     table = [folder / TABLE_FILE] if has_mark(folder / TABLE_FILE, TABLE_HEAD) else []
     table += [folder / CONTENTS_FILE] if has_mark(folder / CONTENTS_FILE, CONTENTS_MARK) else []
     remove([*table, *(folder / name for name in (JOURNAL_FILE, RESULTS_FILE, RUN_FILE))])
+
+
+def short_transform_name(name: str) -> str:
+    """`transform_name`, of a name that is too long for a file its beginning and a hash of the whole."""
+    file = transform_name(name)
+    if _fits(file):
+        return file
+    begin = name[:150]
+    while len(_stem(begin)) > 150:
+        begin = begin[:-1]
+    return f"{_stem(begin)}~{hashlib.sha256(name.encode()).hexdigest()[:16]}.txt"
+
+
+def _fits(file: str) -> bool:
+    return len(file.encode()) <= 255  # of nearly every file system
 
 
 def transform_name(name: str) -> str:

@@ -58,6 +58,7 @@ class Edge:
             the surfaces were independent from point to point; they are not, see `GroupingRules`.
         expected: log-odds by what is known beforehand, as that the scans were taken one after the other.
         of_maps: whether local maps about the scans were registered, not the scans alone.
+        given: whether it was not registered, but is of poses that the caller gave.
         evidence: log-odds that triangles of edges add, see `geomoe3d.multiway.cycles`.
     """
 
@@ -70,6 +71,7 @@ class Edge:
     evidence: float = 0.0
     expected: float = 0.0
     of_maps: bool = False
+    given: bool = False
 
     @property
     def prior(self) -> float:

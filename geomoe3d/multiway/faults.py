@@ -53,7 +53,13 @@ def find_faults(survey: Survey, groups: Sequence[Group], edges: Sequence[Edge]) 
             f"sure ties to the rest, those of {names}{', ...' * (len(left) > 5)}; {counted(most, 'pair')} in all "
             "are looked at again (expert.many_pairs.most_checked)"
         )
-    checks = survey.register_apart(sorted(wanted), of_checks(survey.config), CHECKS_FOLDER)
+    try:
+        checks = survey.register_apart(sorted(wanted), of_checks(survey.config), CHECKS_FOLDER)
+    except GeoMoE3DError as error:  # then nobody knows
+        told = (
+            f"not asked about mirrored axes and units, since its pairs could not be looked at again: {error}"
+        )
+        return {scan: told for part in asked if part not in left for scan in part}
     found = mirrored_scans(asked, checks, unplaced)
     kept = {id(edge.T_target_source) for group in groups for edge in group.edges}
     holding = [e for e in edges if id(e.T_target_source) in kept]

@@ -54,7 +54,7 @@ class InitialPoses:
         for i, j in pairwise(scans):
             T = inverse(self.poses[i]) @ self.poses[j]
             local = shift_frames(T, -shapes[j].origin, -shapes[i].origin)
-            found.append(Edge(j, i, local, known.odometry_confidence, information, self.shift))
+            found.append(Edge(j, i, local, known.odometry_confidence, information, self.shift, given=True))
         return found
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from geomoe3d.batch.folder import foreign, has_mark, transform_name
+from geomoe3d.batch.folder import foreign, has_mark, short_transform_name
 from geomoe3d.clouds.io import READABLE_SUFFIXES, load_points
 from geomoe3d.clouds.transform_files import save_transform
 from geomoe3d.decision.answer import library_versions
@@ -59,6 +59,7 @@ class EdgeReport:
             units, and ``turn_deg`` its angle; None where its scans stand in no common group.
         closes_loop: whether the model hangs together without it, too.
         of_maps: whether local maps about the two scans were registered, not the scans alone.
+        given: whether it was not registered, but is of the initial poses.
         T_target_source: (4, 4) file coordinates.
     """
 
@@ -73,6 +74,7 @@ class EdgeReport:
     closes_loop: bool
     of_maps: bool
     T_target_source: FloatArray
+    given: bool = False
 
     @property
     def kept(self) -> bool:
@@ -389,4 +391,4 @@ def write_model(model: SceneModel, merged_voxel_size: float | None, *, e57: bool
             write_e57(prefix.with_suffix(".e57"), [(n, paths[n], group.poses[n]) for n in names])
         for name, T in group.poses.items():
             comments = [_POSE_MARK, f"scan '{name}' in group {count}, the frame of '{group.reference}'"]
-            save_transform(poses_folder / transform_name(name), T, comments, force=True)
+            save_transform(poses_folder / short_transform_name(name), T, comments, force=True)

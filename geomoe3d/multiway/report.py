@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geomoe3d.batch.store import Outcome
 from geomoe3d.config import expert
 from geomoe3d.decision.scale import DIFFERS
 from geomoe3d.geometry.se3 import shift_frames
@@ -82,8 +83,15 @@ def describe_model(
 
 def _is_ok(survey: Survey, edge: Edge) -> bool:
     """Whether registration alone was sure of a pair of scans."""
-    outcome = None if edge.of_maps else survey.outcomes.get(key_of(edge.source, edge.target))
+    outcome = _outcome(survey, edge)
     return outcome is not None and outcome.status == "ok"
+
+
+def _outcome(survey: Survey, edge: Edge) -> Outcome | None:
+    """What registration said of an edge, where it is that of a pair of scans."""
+    if edge.of_maps or edge.given:
+        return None
+    return survey.outcomes.get(key_of(edge.source, edge.target))
 
 
 def _is_elsewhere(survey: Survey, edge: Edge, report: EdgeReport) -> bool:
@@ -117,7 +125,7 @@ def _report(survey: Survey, edge: Edge, home: dict[int, Group], tree: set[int]) 
                 reason = f"what its two scans share holds them too loosely: the sensor may be {error:.2g} off"
         elif not near:
             reason = f"it contradicts the poses that the other pairs give by {shift:.3g} and {turn:.1f} deg"
-    told = None if edge.of_maps else survey.outcomes.get(key_of(edge.source, edge.target))
+    told = _outcome(survey, edge)
     if fate == "kept" and told is not None and told.result is not None:
         reason = next((said for said in told.result.reasons if said.startswith(DIFFERS)), "")
     if fate == "rejected" and edge.worth <= rules.least_worth:
@@ -125,6 +133,8 @@ def _report(survey: Survey, edge: Edge, home: dict[int, Group], tree: set[int]) 
         if edge.prior > rules.least_worth:
             doubt = "other pairs of the same scans contradict it"
         reason = doubt if not reason else f"{doubt}; {reason}"
+    if edge.given:
+        reason = f"as the initial poses have it{f': {reason}' if reason else ''}"
     return EdgeReport(
         survey.scans[edge.source].name,
         survey.scans[edge.target].name,
@@ -137,6 +147,7 @@ def _report(survey: Survey, edge: Edge, home: dict[int, Group], tree: set[int]) 
         fate in ("kept", "near") and id(edge) not in tree,
         edge.of_maps,
         shift_frames(edge.T_target_source, shape.origin, survey.shapes[edge.target].origin),
+        edge.given,
     )
 
 
@@ -154,3 +165,17 @@ def _why_unplaced(survey: Survey, edges: Sequence[Edge], scan: int) -> str:
     if voices > 1:
         return f"{surest}, but its {voices} likely pairs do not agree on one place clearly enough"
     return f"{surest}, and nothing agrees with it: one pair must be surer, or two must agree"
+
+
+def contradicted_steps(edges: Sequence[EdgeReport]) -> str:
+    """A sentence where the initial poses have scans elsewhere than the model, else empty."""
+    steps = [edge for edge in edges if edge.given and edge.shift is not None]
+    wrong = [edge for edge in steps if edge.fate == "rejected"]
+    if not wrong:
+        return ""
+    worst = max(wrong, key=lambda edge: edge.shift or 0.0)
+    return (
+        f"the initial poses contradict the scans: {len(wrong)} of their {counted(len(steps), 'step')} "
+        f"from scan to scan, the worst from '{worst.target}' to '{worst.source}' by {worst.shift:.3g}; are they in "
+        "the scans' unit, in their order, and of scan into world?"
+    )

@@ -29,7 +29,7 @@ from geomoe3d.multiway.faults import find_faults, forget_checks
 from geomoe3d.multiway.initial import InitialPoses, read_poses
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.pose_graph import Library, require_gtsam
-from geomoe3d.multiway.report import describe_model
+from geomoe3d.multiway.report import contradicted_steps, describe_model
 from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
 from geomoe3d.multiway.survey import Survey
 from geomoe3d.pipeline import resolved
@@ -130,6 +130,7 @@ def register_scans(
     stored = None if fresh else _stored_voxel_size(folder / "pairs")
     clock("look at the scans")
     given = None if initial is None else read_poses(initial, [scan.name for scan in found])
+    of_old = stored is not None and (config is None or config.voxel_size is None)
     config, unusable = _with_voxel_size(resolved(config), stored, found)
     config = _of_many(config, second_look)
     poses = None
@@ -145,7 +146,15 @@ def register_scans(
         found, config, store, labour, progress or None, say,
         sequence=sequence, initial=poses, optimizer=optimizer,
     )  # fmt: skip
-    survey.describe(unusable)
+    try:
+        survey.describe(unusable)
+    except InputError as error:
+        if not of_old:
+            raise
+        raise InputError(
+            f"{error}; the grid of {config.voxel_size:g} is that of the earlier model in '{folder}': where the files "
+            "or their unit are others now, --fresh (fresh=True) begins anew"
+        ) from None
     store.begin()
     if fresh:
         remove_model(folder)
@@ -187,6 +196,8 @@ def register_scans(
     faults = find_faults(survey, groups, assembly.edges)
     clock("write the model")
     model = describe_model(survey, assembly.edges, folder, groups, faults)
+    if contradicted := contradicted_steps(model.edges):
+        say(contradicted)
     write_model(model, merged_voxel_size, e57=e57)
     if page:
         from geomoe3d.multiway.page import save_model_page

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,10 +154,13 @@ def _rounded_up(size: float) -> float:
 
 
 def _unique_names(paths: list[Path]) -> list[str]:
+    alike = Counter(path.with_suffix("") for path in paths)  # some differ by their suffix alone
+    last = [path.stem if alike[path.with_suffix("")] == 1 else path.name for path in paths]
     for depth in range(1, max(len(path.parts) for path in paths) + 1):
         names = [
-            "/".join((*path.parent.parts[len(path.parent.parts) - depth + 1 :], path.stem)) for path in paths
+            "/".join((*path.parent.parts[len(path.parent.parts) - depth + 1 :], name))
+            for path, name in zip(paths, last, strict=True)
         ]
         if len(set(names)) == len(names):
             return names
-    return [str(path) for path in paths]  # two files that differ in their suffix alone
+    return [str(path) for path in paths]  # such as a.ply, a.xyz and a.ply.xyz

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -307,21 +308,28 @@ class Survey:
     ) -> dict[PairKey, Outcome]:
         """Outcomes of pairs by another configuration, kept in a folder of their own beside the others.
 
-        Where that folder cannot be used this is said, and there are none: the model does not depend on them.
+        Where that folder cannot be used this is said, and they are had anew each time. Raises GeoMoE3DError: they
+        cannot be had at all.
         """
         if not pairs:
             return {}
         rows = {pair: self._row(pair) for pair in pairs}
-        try:
-            store = _replacing_store(self.store.folder / place, config)
+
+        def outcomes(folder: Path) -> dict[PairKey, Outcome]:
+            store = _replacing_store(folder, config)
             records, _ = work(list(rows.values()), store, config, self.labour, progress=False, say=self.say)
             return {pair: store.outcome(records[row.id]) for pair, row in rows.items()}
+
+        folder = self.store.folder / place
+        try:
+            return outcomes(folder)
         except GeoMoE3DError as error:
             self.say(
-                f"{counted(len(rows), 'doubtful pair')} could not be looked at again, so scans that are mirrored or "
-                f"in another unit may go unnamed: {error}"
+                f"what '{folder}' holds of {counted(len(rows), 'doubtful pair')} cannot be used, so they are looked at "
+                f"again and not kept; delete that folder to keep them next time: {error}"
             )
-            return {}
+        with TemporaryDirectory() as spare:
+            return outcomes(Path(spare) / place)
 
     def _count(self) -> Callable[[int, int], None] | None:
         """Progress of one round, told as that of all pairs so far proposed."""

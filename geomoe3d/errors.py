@@ -84,6 +84,10 @@ def plain_reason(error: BaseException) -> str:
         return f"{error} is missing in it"
     if isinstance(error, (IndexError, EOFError, struct.error)):
         return "it ends too early, or a number in it is wrong"
+    if isinstance(error, RecursionError):
+        return "its brackets are nested too deeply"
+    if isinstance(error, OverflowError):
+        return "a number in it is too large"
     if isinstance(error, (TypeError, AttributeError)):
         return "a value in it is of another kind than belongs there"
     said = " ".join(str(error).split()) or "its content makes no sense"

@@ -366,7 +366,7 @@ class Line:
             return Explanation(failed_result(clouds, early, self.config, self.clock.stop()), *clouds)
         found = search_larger(*clouds, self.pipeline, guess, self.clock)
         if found is None or found.decision.answer is None:
-            reason = nowhere(*(cloud.name for cloud in clouds))
+            reason = nowhere(clouds[0], clouds[1].name)
             return Explanation(failed_result(clouds, reason, self.config, self.clock.stop()), *clouds)
         decision = found.decision
         judgement = decision.judgement

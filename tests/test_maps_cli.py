@@ -16,6 +16,7 @@ from geomoe3d import Map
 from geomoe3d.cli import index
 from geomoe3d.cli.errors import ExitCode, run
 from geomoe3d.cli.main import geomoe3d as program
+from geomoe3d.errors import EmptyCloudError
 
 
 def ask(*words):
@@ -125,19 +126,48 @@ def test_a_sequence_goes_on_after_a_scan_that_cannot_be_read(house, scan, tmp_pa
     (tmp_path / "scans").mkdir()
     np.save("scans/a.npy", scan[0])
     np.save("scans/b.npy", np.full((10, 3), np.nan))
+    few = np.random.default_rng(0).uniform(0, 2 * GRID, (10, 3))
+    np.save("scans/c.npy", few)
+    (tmp_path / "scans/d.ply").touch()
     assert (
         ask("locate", "scans", "house.map", "--voxel-size", GRID, "--output", "poses.tum")
         == ExitCode.BAD_INPUT
     )
     told = capfd.readouterr()
-    assert "1 of 2 ok" in told.out
+    assert "1 of 4 ok" in told.out
     assert "scans per second" in told.out
-    assert "b" in told.err
+    assert "b: " in told.err
+    assert "of 10 points remain" in told.err
+    assert "at least 3 are needed" in told.err
+    assert "d.ply' is an empty file (0 bytes)" in told.err
+    assert "warning" not in told.err
     lines = (tmp_path / "poses.tum").read_text().splitlines()
     pose = [line.split() for line in lines if line[0] != "#"]
     assert len(pose) == 1
     assert pose[0][0] == "0"
-    assert "# 1 b: unusable" in lines
+    assert lines[-3:] == ["# 1 b: unusable", "# 2 c: unusable", "# 3 d: unusable"]
+
+
+@pytest.mark.parametrize("name", ["empty.ply", "empty.las", "empty.e57", "empty.npy"])
+def test_an_empty_file_is_named_as_one_also_by_index(tmp_path, monkeypatch, capfd, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).touch()
+    assert ask("index", name, "out.map") == ExitCode.BAD_INPUT
+    assert f"{name}' is an empty file (0 bytes)" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "scan",
+    [np.outer(np.arange(3.0), [1, 0, 0]), np.random.default_rng(0).uniform(0, 3, (10, 3))],
+    ids=["three points of a line", "ten at random"],
+)
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_scan_of_too_few_points_for_the_search_is_refused(building, scan):
+    world = Map.from_cloud(building, voxel_size=2.0 if len(scan) > 3 else 1.0)
+    with pytest.raises(
+        EmptyCloudError, match=r"'scan': [12] of \d+ points remain .* at least 3 are needed; give a"
+    ):
+        world.locate(scan)
 
 
 # ---- a map that is indexed again -----------------------------------------------------------------------

@@ -122,8 +122,9 @@ def test_all_scans_stand_in_one_e57_file_with_their_poses(scanned_room, tmp_path
     assert np.abs(found - np.concatenate(expected)).max() < 1e-5
 
 
+@pytest.mark.parametrize("marked", [False, True])
 @pytest.mark.parametrize("kind", ["tum", "kitti", "json", "names", "model"])
-def test_poses_are_read_as_they_were_written(tmp_path, kind):
+def test_poses_are_read_as_they_were_written(tmp_path, kind, marked):
     poses = [make_transform(Rotation.random(random_state=k).as_matrix(), UTM * k) for k in range(3)]
     names = ["a", "b", "c"]
     scans = [{"name": n, "T_reference_scan": T.tolist()} for n, T in zip(names, poses, strict=True)]
@@ -134,7 +135,7 @@ def test_poses_are_read_as_they_were_written(tmp_path, kind):
         "names": json.dumps({n: T.tolist() for n, T in zip(names, poses, strict=True)}),
         "model": json.dumps({"groups": [{"scans": scans}]}),
     }[kind]
-    (tmp_path / "poses").write_text(text)
+    (tmp_path / "poses").write_text(text, encoding="utf-8-sig" if marked else "utf-8")
     for found, T in zip(read_poses(tmp_path / "poses", names), poses, strict=True):
         assert np.abs(found - T).max() < 1e-9
 
@@ -230,6 +231,27 @@ def test_files_in_another_unit_than_the_earlier_model_are_told_of_its_grid(scann
         (b"# nothing\n", "its lines hold no numbers"),
         (b"\xff\xfe", "it is no text in UTF-8"),
         (b'{"groups": [{"a": 1}]}', "the key 'scans' is missing"),
+        *(
+            (b'{"groups": %s}' % of, "its 'groups' are not those of a poses.json")
+            for of in (b'["a"]', b"7", b"[[1]]")
+        ),
+        (b"", r"an empty file \(0 bytes\)"),
+        (b"null", "line 1: 'null' is no number"),
+        (b"[" * 100_000, "its brackets are nested too deeply"),
+        (
+            b"[[%s]]" % (b"[1, 0, 0, 0]," * 7 + b"[0, 0, 0, 1" + b"0" * 400 + b"]"),
+            "pose 1 is 8 rows of 4 numbers",
+        ),
+        (b"[%s]" % b",".join([b"[1%s, 0, 0, 0]" % (b"0" * 400)] * 4), "it holds 4 rows of 4 numbers"),
+        (b"[[[1%s,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]],null]" % (b"0" * 400), "pose 2 is null"),
+        (
+            b'{"a": [1%s,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "b": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}'
+            % (b"0" * 400),
+            "pose of 'a': a transform must be 4 rows of 4 finite numbers",
+        ),
+        (b"3 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "the time 0 stands behind 3"),
+        (b"0 0 0 0 0 0 0 1\n1 1e300 0 0 0 0 0 1\n", r"pose of 'b' has the translation \[1e\+300, 0.0, 0.0\]"),
+        (b"0 0 0 0 1e300 0 0 1\n1 0 0 0 0 0 0 1\n", "the quaternion has the length inf, expected 1"),
     ],
 )
 def test_poses_that_are_none_are_refused_in_plain_words(tmp_path, content, words):

@@ -145,6 +145,9 @@ def test_first_guesses_of_other_programs(tmp_path: Path, number: int) -> None:
         ("# static_transform_publisher", "0 rows"),
         ("", "0 rows"),
         ("\0\0\0\0", "no text"),
+        ("[" + "9" * 401 + ", 0]", "too large"),
+        ("{" + '"a": {' * 100_000, "nested too deeply"),
+        ('{"T": [[1' + "0" * 400 + ", 0, 0, 0]]}", "too large"),
         ("[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]", "a block of 1 x 1 x"),
     ],
 )

@@ -23,6 +23,7 @@ from geomoe3d.clouds.transform_formats import (
     of_matrix,
     parse_transform,
 )
+from geomoe3d.config import expert
 from geomoe3d.errors import FormatError, InputError, cannot_read, plain_reason
 from geomoe3d.geometry.se3 import scale_of
 from geomoe3d.runtime.files import write_atomically, write_text
@@ -193,12 +194,19 @@ def load_transform(path: str | os.PathLike[str]) -> FloatArray:
             T = parse_transform(data.decode("utf-8-sig", errors="replace"))
     except OSError as error:
         raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None
-    except (ValueError, EOFError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (
+        ValueError, EOFError, LookupError, TypeError, AttributeError, RecursionError, OverflowError
+    ) as error:  # fmt: skip
         raise FormatError(f"'{path}' holds no transform: {plain_reason(error)}") from None
     if T.shape != (4, 4):
         raise FormatError(f"'{path}' holds {shape_in_words(T.shape)}, expected 4 rows of 4")
     if not np.isfinite(T).all():
         raise InputError(f"'{path}' holds no transform, its numbers are not finite")
+    limit = expert().loading.most_coordinate
+    if np.abs(T[:3, 3]).max() > limit:
+        raise InputError(
+            f"'{path}': the translation is {T[:3, 3].tolist()}, beyond the limit of {limit:g}; correct it"
+        )
     return T
 
 

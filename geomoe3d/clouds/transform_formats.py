@@ -136,7 +136,7 @@ def _of_rows(rows: list[list[float]], remarks: str) -> FloatArray:
         order = [word for word in re.findall(r"[a-z]+", remarks) if word in _SEVEN]
         names = order[:7] if sorted(order[:7]) == sorted(_SEVEN) else _SEVEN
         found = dict(zip(names, rows[0][-7:], strict=True))
-        return _of_seven([found[name] for name in _SEVEN])
+        return of_seven([found[name] for name in _SEVEN])
     if shape[0] > 1 and shape[1] in (7, 8, 12):
         raise FormatError(
             f"{counted(shape[0], 'row')} of {counted(shape[1], 'number')}; give a file of one transform"
@@ -160,7 +160,8 @@ def of_matrix(values: FloatArray) -> FloatArray:
     return T
 
 
-def _of_seven(values: Sequence[float]) -> FloatArray:
+def of_seven(values: Sequence[float]) -> FloatArray:
+    """(4, 4) from a translation and a quaternion x y z w. Raises FormatError: its length is not 1."""
     from scipy.spatial.transform import Rotation
 
     length = float(np.linalg.norm(values[3:]))
@@ -203,7 +204,7 @@ def _of_publisher(text: str) -> FloatArray:
         raise FormatError(str(error)) from None
     if uses_angles:
         turn = Rotation.from_euler("ZYX", angles).as_quat().tolist()
-    return _of_seven([*place, *turn])
+    return of_seven([*place, *turn])
 
 
 def _of_document(data: Any) -> FloatArray:
@@ -228,7 +229,7 @@ def _motions(data: Any, depth: int = 0) -> Any:
         place = data.get("translation", data.get("position"))
         turn = data.get("rotation", data.get("orientation"))
         if isinstance(place, dict) and isinstance(turn, dict):
-            yield _of_seven([*(float(place[a]) for a in "xyz"), *(float(turn[a]) for a in "xyzw")])
+            yield of_seven([*(float(place[a]) for a in "xyz"), *(float(turn[a]) for a in "xyzw")])
             return
         for value in data.values():
             yield from _motions(value, depth + 1)

@@ -81,7 +81,9 @@ class MapsExpert(Section):
         (0, 1),
         "of a mean direction to the sensors below which they saw a surface from everywhere",
     )
-    least_points: int = constant(3, "points", (3, 1_000_000), "of the map that must remain on a grid")
+    least_points: int = constant(
+        3, "points", (3, 1_000_000), "of the map, and of a scan, that must remain on a grid"
+    )
     least_twin: int = constant(
         30, "points", (3, 1_000_000), "of the map around a place, by which copies of it are sought"
     )

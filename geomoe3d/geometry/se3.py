@@ -130,6 +130,7 @@ def _not_rigid(R: FloatArray, tolerance: float) -> str:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what comes of huge numbers is refused
 def check_motion(T: ArrayLike) -> FloatArray:
     """A user's matrix as a rigid motion (4, 4), its rotation projected onto SO(3). Raises InputError: another
     shape, non-finite numbers, a last row other than 0 0 0 1, or a linear part that is no rotation: R^T R

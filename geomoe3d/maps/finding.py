@@ -115,7 +115,10 @@ class Finder:
             if level is None:
                 continue
             if level is not search.level:
-                search = self._begun(cloud, view, level, clock, whole.level if look == "finer" else None)
+                try:
+                    search = self._begun(cloud, view, level, clock, whole.level if look == "finer" else None)
+                except EmptyCloudError:  # too sparse for this grid: what the others say stands
+                    continue
             more = look != "quick"
             candidates = search.candidates(more=more, near=where, given=[*local, *known], times=times)
             asked, known = known, [h.T_target_source for h in likely(candidates, count)]

@@ -161,10 +161,17 @@ class Level:
 
 
 def described(scan: PreparedCloud, describe: Descriptor) -> tuple[PreparedCloud, Compared]:
-    """A scan with the features of a descriptor, and what is compared of it with a map."""
+    """A scan with the features of a descriptor, and what is compared of it with a map. Raises EmptyCloudError: that
+    is fewer than 3 points."""
+    rows = one_per_voxel(scan, SPACING)
+    if len(rows) < (least := expert().maps.least_points):
+        raise EmptyCloudError(
+            f"'{scan.name}': {len(rows)} of {counted(scan.num_input, 'point')} remain to be compared with the map on "
+            f"a {SPACING * scan.voxel_size:.4g} grid, at least {least} are needed; give a denser scan or a voxel size "
+            "that fits it"
+        )
     found = with_features(scan, describe)
     fpfh = found.features if describe == FpfhDescriptor() else None
-    rows = one_per_voxel(scan, SPACING)
     features = LearnedDescriptor().at(pyramid(scan, fpfh), rows)
     return found, Compared(scan.points[rows], scan.normals[rows], features)
 

@@ -6,8 +6,9 @@ import json
 import math
 from dataclasses import dataclass
 
+from geomoe3d.decision.remarks import flatness
 from geomoe3d.result import RegistrationResult, Status
-from geomoe3d.types import FloatArray
+from geomoe3d.types import FloatArray, PointCloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,8 @@ class Location:
         return json.dumps(told, indent=indent, allow_nan=False)
 
 
-def nowhere(scan: str, world: str) -> str:
+def nowhere(scan: PointCloud, world: str) -> str:
     """The reason of an answer without any candidate."""
-    return f"no place was found in '{world}' at which '{scan}' could lie"
+    flat = flatness(scan.name, scan.points)
+    said = f"no place was found in '{world}' at which '{scan.name}' could lie"
+    return said if flat is None else f"{said}: {flat}"

@@ -269,7 +269,7 @@ class Map:
         local = None if asked is None else (asked[0] - self._voxels.origin, asked[1])
         best, ranked = self._finder(cloud, scan, guesses, local, max(k, expert().maps.candidates), clock)
         if best is None or best.decision.answer is None:
-            return self._nowhere(cloud, nowhere(cloud.name, self.name), clock)
+            return self._nowhere(cloud, nowhere(cloud, self.name), clock)
         decision = self._told(best, cloud, clock)
         result = finished_result(best.pair, decision, self.config, clock.stop())
         origins, top = (cloud.origin, self._voxels.origin), best.decision.answer.score

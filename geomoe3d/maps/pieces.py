@@ -56,7 +56,7 @@ def pieces(cloud: Any, size: int) -> Pieces:
         InputError, FormatError, EmptyCloudError: as `load_points`; of a streamed file while it is read.
     """
     path = Path(cloud) if isinstance(cloud, (str, os.PathLike)) else None
-    if path is not None and path.is_file():
+    if path is not None and path.is_file() and path.stat().st_size:  # an empty file is named as one below
         take_inherited()
         stream = _STREAMED.get(READERS.get(path.suffix.lower()))
         streamed = None if stream is None else stream(path, size)

@@ -53,7 +53,7 @@ def test_register_is_a_command_of_its_own(monkeypatch, capsys):
         (["register", "a", "b", "--set", "seed"], "key=value"),
         (["register", "a", "b", "--voxel-size", "0"], "greater than 0"),
         (["register", "a", "b", "--voxel-size", "-1"], "greater than 0"),
-        (["register", "a", "b", "--voxel-size", "big"], "voxel_size"),
+        (["register", "a", "b", "--voxel-size", "big"], "--voxel-size"),
         (["register", "a", "b", "--seed", "-1"], "seed"),
         (["register", "a", "b", "--voxel-size", "inf"], "finite"),
         (["register", "a", "b", "--config", "/there/is/none.yaml"], "/there/is/none.yaml"),

@@ -243,7 +243,7 @@ def test_a_rough_guess_alone_is_refined_and_chosen():
 @pytest.mark.parametrize(
     ("guess", "message"),
     [
-        (np.eye(3), "shape"),
+        (np.eye(3), "4 rows of 4 finite numbers, found 3 rows of 3"),
         (np.full((4, 4), np.nan), "finite"),
         (2 * np.eye(4), "no rigid transform"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrors"),

@@ -117,9 +117,9 @@ def test_written_files_have_the_same_bytes_and_read_back(tmp_path, pair):
 
     first = write_sample_pair(tmp_path / "a" / "deep", seed=0)
     second = write_sample_pair(tmp_path / "b", seed=0)
-    for one, two in zip(vars(first).values(), vars(second).values(), strict=True):
+    for one, two in zip(first, second, strict=True):
         assert one.read_bytes() == two.read_bytes()
-    assert [path.name for path in vars(first).values()] == ["source.ply", "target.ply", "T_target_source.txt"]
+    assert [path.name for path in first] == ["source.ply", "target.ply", "T_target_source.txt"]
     np.testing.assert_array_equal(np.loadtxt(first.truth), pair[2])
     assert "maps source.ply into target.ply: p_target = R p_source + t" in first.truth.read_text()
     for path, cloud in ((first.source, pair[0]), (first.target, pair[1])):

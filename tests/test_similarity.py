@@ -146,7 +146,7 @@ def test_the_page_names_the_scale_and_moves_by_it(tmp_path: Path) -> None:
     )
     assert shown.kept().sum() == view.kept().sum()
     text = render_page(shown)
-    assert "= 0.3048 R p" in text and "lengths of the target over those of the source" in text
+    assert "= 0.3048 R p" in text and "lengths of the source times this are those of the target" in text
     half_way = browse(tmp_path, text, script="", wish="#at=0.5&renderer=canvas2d")["model"]
     model = np.array([float(v) for v in half_way.split()]).reshape(4, 4).T  # a similarity on the way too
     assert scale_of(model) == pytest.approx(np.sqrt(FEET), rel=1e-9)

@@ -111,7 +111,7 @@ def test_picture_says_the_numbers():
         NASTY,
         "target_scan.ply",
         "200 of 300 correspondences",
-        "60%",
+        "60 %",
         "0.05",
         "1.25",
         "179.5°",

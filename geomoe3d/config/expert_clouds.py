@@ -13,10 +13,10 @@ class LoadingExpert(Section):
     """What becomes of a file's points (`clouds/loading.py`, `clouds/recentre.py`)."""
 
     most_coordinate: float = constant(
-        1000000000000.0, "cloud units", (1.0, 1e15), "beyond which a coordinate is an error"
-    )
-    most_shift: float = constant(
-        1e9, "cloud units", (1.0, 1e15), "beyond which the translation of a given pose is an error"
+        1000000000000.0,
+        "cloud units",
+        (1.0, 1e15),
+        "beyond which a coordinate, or the translation of a given pose, is an error",
     )
     least_extent: float = constant(
         1e-15, "cloud units", (0.0, 1e-3), "under which a cloud is an error: squares of lengths vanish"

@@ -68,7 +68,7 @@ def read_poses(path: str | os.PathLike[str], names: Sequence[str]) -> tuple[Floa
 
     Raises:
         InputError: no such file, another number of poses than scans, no rigid transform, or one further off than
-            `expert.loading.most_shift`.
+            `expert.loading.most_coordinate`.
         FormatError: none of these formats.
     """
     path = Path(path)
@@ -98,7 +98,7 @@ _KINDS = "lines of TUM or KITTI, or JSON"
 
 def _checked(T: FloatArray, name: str) -> FloatArray:
     """A rigid motion that is not too far off."""
-    limit, shift = expert().loading.most_shift, T[:3, 3]
+    limit, shift = expert().loading.most_coordinate, T[:3, 3]
     if np.isfinite(shift).all() and np.abs(shift).max() > limit:
         raise InputError(
             f"the pose of '{name}' has the translation {shift.tolist()}, beyond the limit of {limit:g}; correct it or "

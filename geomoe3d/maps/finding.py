@@ -98,9 +98,8 @@ class Finder:
             elif look == "finer":
                 best_fits = expert().detail.close * fitting[0][0] if fitting else 0.0
                 fits = [T for score, T in fitting if score >= best_fits]
-                if (
-                    not fits or times > 1.0
-                ):  # few places, for a fine grid, unless more are asked for than usual
+                # Few places, for a fine grid, unless more are asked for than usual.
+                if not fits or times > 1.0:
                     known = [*fits, *known, *(T for first in known[:1] for T in whole.twins(first, count))]
                 else:
                     known = list(fits)

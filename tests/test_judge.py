@@ -18,7 +18,6 @@ from geomoe3d.decision import confidence
 from geomoe3d.decision.confidence import Judgement, confidence_score, lead_over
 from geomoe3d.decision.information import Information, measure_information
 from geomoe3d.geometry.se3 import rotation_error_deg, transform_points
-from geomoe3d.runtime.words import of_the_score
 from geomoe3d.scoring.network import Opinion
 from geomoe3d.scoring.surfaces import Evidence
 from geomoe3d.types import Hypothesis
@@ -267,11 +266,7 @@ def test_a_rival_is_told_of_by_what_makes_it_one(
     assert any(re.search(words, reason) for reason in judged.reasons)
 
 
-def test_shares_of_a_score_read_well_at_either_end() -> None:
-    said = [of_the_score(share) for share in (0.0, 0.004, 0.01, 0.5, 1.0, 1.004, 1.97, 250.0)]
-    assert said[:2] == ["under 1 % of the score"] * 2
-    assert said[2:6] == ["1 % of the score", "50 % of the score", "100 % of the score", "100 % of the score"]
-    assert said[6:] == ["1.97 times the score", "250 times the score"]
+def test_a_repeated_place_is_told_with_its_share_of_the_score() -> None:
     was = Judgement("ok", (), 0.99)
     assert "has 1.97 times the score of this one and would" in confidence.repeated(was, 1 / 1.97).reasons[0]
     assert "has 41 % of the score of this one and would" in confidence.repeated(was, 1 / 0.41).reasons[0]

@@ -10,7 +10,7 @@ import pytest
 from geomoe3d.errors import plain_reason
 from geomoe3d.runtime.plain import plain
 from geomoe3d.runtime.provenance import differences, in_words
-from geomoe3d.runtime.words import counted, shape_in_words
+from geomoe3d.runtime.words import counted, of_the_score, shape_in_words
 
 
 @pytest.mark.parametrize(
@@ -82,3 +82,10 @@ def test_what_numpy_says_of_text_is_told_in_plain_words(rows):
         "'x' in column 2 is no number",
         "a row has 2 numbers, those before it 3",
     )
+
+
+def test_shares_of_a_score_read_well_at_either_end():
+    said = [of_the_score(share) for share in (0.0, 0.004, 0.01, 0.5, 1.0, 1.004, 1.97, 250.0)]
+    assert said[:2] == ["under 1 % of the score"] * 2
+    assert said[2:6] == ["1 % of the score", "50 % of the score", "100 % of the score", "100 % of the score"]
+    assert said[6:] == ["1.97 times the score", "250 times the score"]

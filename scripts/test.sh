@@ -42,13 +42,14 @@ if "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
 else
   say "mypy is left out: the numpy whose types the code is checked against needs Python 3.11"
 fi
+# All tests take half an hour of one core, so two to four processes share them; those of one file stay together.
+shared=(-n auto --maxprocesses 4 --dist loadfile)
 if [ $# -eq 0 ]; then
   say "pytest, the numbers that must not hang on the processor, by a narrow instruction set"
-  bash scripts/narrow.sh narrowest "$python" -m pytest -q tests/test_choice.py tests/test_consensus.py \
-    tests/test_judge.py tests/test_motion_judge.py tests/test_multiway_grouping.py tests/test_network_folded.py \
-    tests/test_registration.py
+  bash scripts/narrow.sh narrowest "$python" -m pytest -q "${shared[@]}" tests/test_choice.py \
+    tests/test_consensus.py tests/test_judge.py tests/test_motion_judge.py tests/test_multiway_grouping.py \
+    tests/test_network_folded.py tests/test_registration.py
+  set -- "${shared[@]}"
 fi
 say "pytest"
-# All of them take half an hour of one core, so they are shared by two to four; those of one file stay together.
-if [ $# -eq 0 ]; then set -- -n auto --maxprocesses 4 --dist loadfile; fi
 exec "$python" -m pytest "$@"

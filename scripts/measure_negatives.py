@@ -7,6 +7,7 @@ rooms: all pairs of scans of each dev scene, most of which share nothing but the
 generated rooms in FOLDER. world: outdoor and indoor scans of one place beside those of another. mirrored:
 overlapping pairs of the dev scenes whose source is its own mirror image, where no answer is right.
 
+`As one batch`: with confidences for the share of pairs that belong together, as `geomoe3d batch` estimates it.
 Truth is used for scoring alone: an answer is right within 15 deg and 30 cm of it at the frame's origin, and never
 where there is none. Lines go to OUT/KIND.jsonl as they are finished; called again, the command goes on.
 """
@@ -23,9 +24,12 @@ import click
 import numpy as np
 from measure_multiway import dev_rooms, generated_rooms
 
+from geomoe3d.batch.mix import share_that_belongs
 from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import find_data_root
+from geomoe3d.decision.confidence import prior_logit
+from geomoe3d.decision.repeat import logit
 from geomoe3d.evaluation.intervals import wilson
 from geomoe3d.geometry.se3 import inverse, rotation_error_deg, translation_error
 from geomoe3d.registration import Registrar
@@ -113,13 +117,18 @@ def _is_right(T: FloatArray, truth: FloatArray | None) -> bool:
 
 def _tell(group: str, lines: list[dict[str, Any]]) -> None:
     surely = [line for line in lines if line["confidence"] >= 0.95]
+    confidences = np.array([line["confidence"] for line in lines])
+    share = share_that_belongs(confidences)
+    among = 1 / (1 + np.exp(-np.array([logit(value) for value in confidences]) - min(prior_logit(share), 0)))
+    still = [line["right"] for line, value in zip(lines, among, strict=True) if value >= 0.95]
     accepted = [line for line in lines if line["status"] == "ok"]
     right = sum(line["right"] for line in accepted)
     low, high = wilson(right / len(accepted), len(accepted)) if accepted else (0.0, 100.0)
     click.echo(
         f"{group[:44]:44s} {len(lines):5d} pairs, ok {len(accepted)}, wrong and ok {len(accepted) - right}, precision "
         f"{100 * right / max(len(accepted), 1):.1f} [{low:.1f}, {high:.1f}] %, confidence >= 0.95: "
-        f"{len(surely)}, wrong {sum(not line['right'] for line in surely)}"
+        f"{len(surely)}, wrong {sum(not line['right'] for line in surely)}; as one batch, {100 * share:.0f} % of which "
+        f"belong together: {len(still)}, wrong {len(still) - sum(still)}"
     )
 
 

@@ -21,6 +21,7 @@ from geomoe3d.batch.folder import (
     write_transforms,
 )
 from geomoe3d.batch.memory import LONG_READ, choose_workers, gibibytes, worker_bytes
+from geomoe3d.batch.mix import shared_out
 from geomoe3d.batch.store import BatchStore, Outcome
 from geomoe3d.batch.table import PairLike, PairRow, as_rows, read_pairs
 from geomoe3d.batch.task import Settings, Task, as_record, make_ready, register_pair
@@ -45,12 +46,14 @@ class BatchReport:
         outcomes: one per pair, in the order given.
         made: pairs done by this call.
         kept: pairs that were done already.
+        share: of the pairs that seem to belong together, where it lowered the confidences (`geomoe3d.batch.mix`).
     """
 
     folder: Path
     outcomes: tuple[Outcome, ...]
     made: int
     kept: int
+    share: float | None = None
 
     @property
     def ok(self) -> bool:
@@ -169,7 +172,8 @@ def register_pairs(
     """Register many pairs into a folder, where an interrupted batch is gone on with.
 
     Called again with the same folder it does what is missing: new pairs, and pairs whose row or files
-    changed. A cloud that cannot be read fails its own pairs alone. Answers do not depend on who did the work.
+    changed. A cloud that cannot be read fails its own pairs alone. Answers do not depend on who did the work. Where few
+    of the pairs belong together, confidences are lower than of each pair alone (`geomoe3d.batch.mix`).
 
     Args:
         pairs: a CSV file as `geomoe3d.batch.table.read_pairs` explains, or (source, target) paths.
@@ -202,7 +206,8 @@ def register_pairs(
     labour = Labour(workers, scheduler, cache).checked()
     store = BatchStore(folder, config, fresh=fresh)
     check_extras(folder, [row.id for row in rows], transforms=transforms, page=page, pages=pages)
-    records, kept = work(rows, store, config, labour, retry, progress=progress, say=say)
+    alone, kept = work(rows, store, config, labour, retry, progress=progress, say=say)
+    records, share = shared_out(alone.values(), config)
     outcomes = tuple(store.outcome(records[row.id]) for row in rows)
     store.write_results(records[row.id] for row in rows)
     if transforms:
@@ -217,7 +222,7 @@ def register_pairs(
         from geomoe3d.batch.page import save_batch_page
 
         save_batch_page(folder / PAGE_FILE, rows, outcomes, progress=told)
-    return BatchReport(folder, outcomes, len(rows) - kept, kept)
+    return BatchReport(folder, outcomes, len(rows) - kept, kept, share)
 
 
 def _fingerprints(rows: list[PairRow], contents: Contents, say: Callable[[str], None]) -> dict[str, str]:

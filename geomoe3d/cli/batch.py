@@ -82,6 +82,13 @@ def table(report: BatchReport) -> str:
     for status, count in report.counts().items():
         word = status.replace("_", " ") if status != "error" else "not registered"
         lines.append(f"  {click.style(word, fg=_COLORS[status]):24} {count:>7,}  {count / total:6.1%}")
+    if report.share is not None:
+        lines += [
+            "",
+            f"  About {100 * report.share:.0f} % of these pairs seem to belong together. Each is believed as in such a "
+            "mix, less than alone;",
+            "  what you know of it is given with --set decision.prior=0.5.",
+        ]
     doubtful = sorted((o for o in report.outcomes if o.status != "ok"), key=lambda o: (o.confidence, o.id))
     if doubtful:
         lines.append("")

@@ -90,6 +90,12 @@ class ConfidenceExpert(Section):
         "that a pair overlaps, in the mix of the fit",
         "300 related pairs, and 160 unrelated ones that count a quarter each",
     )
+    mix_pairs: float = constant(
+        20.0,
+        "pairs",
+        (0, 1e6),
+        "of the mix of the fit that count with those of a batch when the share that belongs together is estimated",
+    )
     least_score: float = constant(1e-3, "surface score", (1e-9, 1), "below which less says no more")
     added_support: float = constant(
         0.002, "share", (1e-9, 1), "added to the share of agreeing matches before its log"

@@ -136,7 +136,7 @@ class SecondLookConfig(Section):
         "others, its features score; a name as descriptor.name, with its defaults. none, or the same as that: no",
     )
     min_confidence: float = Field(
-        0.96,
+        0.97,
         ge=0,
         le=1,
         description="an answer found with that descriptor, checked by these scorers or sought twice is ok from this "
@@ -239,7 +239,7 @@ class DecisionConfig(Section):
         gt=0,
         lt=1,
         description="share of the pairs you ask that do overlap, where you know it: the confidence is for such a mix; "
-        "None: nine in ten do, as in the mix that it was fitted on",
+        "None: nine in ten do, as in the mix that it was fitted on, or fewer where a batch shows it",
     )
 
 

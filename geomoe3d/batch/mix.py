@@ -1,0 +1,82 @@
+"""How many pairs of a batch belong together, by their confidences, and what each is worth beside the others.
+
+The confidence of a pair alone is for a mix in which nine of ten overlap. Where all pairs of many scans are asked, few
+do: wrong answers are then as many as right ones of the same evidence, and each must be believed less. Answers are only
+made less sure here, never surer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from geomoe3d.config import RegistrationConfig, expert
+from geomoe3d.decision.confidence import prior_logit, said_below
+from geomoe3d.decision.repeat import logit
+from geomoe3d.types import FloatArray
+
+Record = dict[str, Any]
+ALONE = "confidence_alone"
+"""Evidence that holds what the confidence was before."""
+
+
+def shared_out(
+    records: Iterable[Record], config: RegistrationConfig
+) -> tuple[dict[str, Record], float | None]:
+    """Records by id, their confidences and statuses for the mix of the batch, and its share of pairs that belong
+    together; None, and nothing is changed, where a prior is configured or the share is no lower than in the fit.
+
+    A confidence p becomes the logistic function of logit(p) + logit(share) - logit(fitted prior). An answer that was
+    ok and falls below ``decision.min_confidence`` is low_confidence, and says so.
+
+    Args:
+        records: as the journal keeps them; left as they are.
+        config: that they were made with.
+    """
+    records = list(records)
+    unchanged = {record["id"]: record for record in records}
+    found = [record["result"] for record in records if record["result"] is not None]
+    if config.decision.prior is not None or not found:
+        return unchanged, None
+    share = share_that_belongs(np.array([result["confidence"] for result in found]))
+    added = prior_logit(share)
+    if added >= 0:
+        return unchanged, None
+    least = config.decision.min_confidence
+    return {name: _less_sure(record, added, share, least) for name, record in unchanged.items()}, share
+
+
+def share_that_belongs(confidences: FloatArray) -> float:
+    """The share of pairs whose answers are right, of confidences (n,) that each is for the mix of the fit.
+
+    As if `mix_pairs` more had been asked of that mix, so that few pairs say little.
+
+    Source: Saerens et al., Neural Computation 2002 (expectation maximisation of prior probabilities).
+    """
+    known, fitted = expert().confidence.mix_pairs, expert().confidence.fitted_prior
+    alone = np.array([logit(value) for value in confidences])
+    share, before = fitted, 0.0
+    while abs(share - before) > 1e-6:
+        before = share
+        right = 1 / (1 + np.exp(-alone - prior_logit(share)))
+        share = float((right.sum() + known * fitted) / (len(right) + known))
+    return share
+
+
+def _less_sure(record: Record, added: float, share: float, least: float) -> Record:
+    result = record["result"]
+    if result is None:
+        return record
+    alone = result["confidence"]
+    confidence = float(1 / (1 + np.exp(-logit(alone) - added)))
+    evidence = {**result["evidence"], ALONE: alone}
+    result = {**result, "confidence": min(confidence, alone), "evidence": evidence}
+    if result["status"] == "ok" and confidence < least:
+        reason = (
+            f"about {100 * share:.0f} % of the pairs of this batch belong together; among so many others the "
+            f"confidence is {said_below(confidence, least)} ({alone:.3f} by itself), below {least:.2f}"
+        )
+        result |= {"status": "low_confidence", "reasons": [*result["reasons"], reason]}
+    return {**record, "result": result}

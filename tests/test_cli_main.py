@@ -10,7 +10,7 @@ import pytest
 from command_line import ROOT, call
 
 from geomoe3d import __version__
-from geomoe3d.cli.main import VERBS, register_main
+from geomoe3d.cli.main import VERBS, geomoe3d, register_main
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -18,6 +18,21 @@ from geomoe3d.cli.main import VERBS, register_main
 def test_help_of_every_verb(verb, option, capsys):
     assert call(verb, option) == 0
     assert f"Usage: geomoe3d {verb}" in capsys.readouterr().out
+
+
+def all_commands(command, words=()):
+    found = [words]
+    for name in getattr(command, "commands", None) or (() if words else VERBS):
+        inner = command.get_command(None, name)
+        found += [] if inner.hidden else all_commands(inner, (*words, name))
+    return found
+
+
+@pytest.mark.parametrize("words", all_commands(geomoe3d), ids=" ".join)
+def test_no_help_shows_the_kinds_of_values_that_a_programmer_knows(words, capsys):
+    assert call(*words, "--help") == 0
+    text = capsys.readouterr().out
+    assert not re.findall(r"\b(?:INTEGER|FLOAT|RANGE|TEXT|BOOLEAN|PATH|DIRECTORY)\b|[0-9x][<>]=?", text)
 
 
 def test_help_lists_every_verb_with_its_purpose(capsys):
@@ -57,6 +72,21 @@ def test_register_is_a_command_of_its_own(monkeypatch, capsys):
         (["register", "a", "b", "--seed", "-1"], "seed"),
         (["register", "a", "b", "--voxel-size", "inf"], "finite"),
         (["register", "a", "b", "--config", "/there/is/none.yaml"], "/there/is/none.yaml"),
+        (
+            ["multiway", "a", "b", "--neighbors", "0"],
+            "'0' is not allowed here; give a whole number, at least 1",
+        ),
+        (
+            ["multiway", "a", "b", "--rounds", "1.5"],
+            "'1.5' is not allowed here; give a whole number, at least 0",
+        ),
+        (["locate", "a", "b", "--within", "nan"], "'nan' is not allowed here; give a number, greater than 0"),
+        (
+            ["pose", "a", "b", "--threshold", "inf"],
+            "'inf' is not allowed here; give a number, greater than 0",
+        ),
+        (["pose", "a", "b", "--keypoints", "7"], "a whole number, at least 8 and at most 100000"),
+        (["data", "features", "a", "b", "--min-overlap", "1.01"], "a number, at least 0 and at most 1"),
         (["register", "a"], "TARGET"),
         (["register", "a", "b", "c"], "(c); the file to write is given by --output"),
         (

@@ -154,7 +154,7 @@ def test_methods_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         (["--method", "consensus"], "gives clouds"),
         (["--method", "geomoe3d", "--track", "2k"], "no track '2k'"),
         (["--method", "geomoe3d", "--every", "0"], "at least 1"),
-        (["--method", "geomoe3d", "--workers", "0"], "at least 1 worker"),
+        (["--method", "geomoe3d", "--workers", "0"], "at least 1"),
         (["--method", "geomoe3d", "--benchmark", "unrelated", "--unrelated", "0"], "at least 1 unrelated"),
         (["--method", "geomoe3d", "--set", "voxel=1"], "voxel_size"),
         (["--method", "kiss-matcher", "--set", "voxel_size=1"], "not among those given"),

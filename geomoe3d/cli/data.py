@@ -17,18 +17,21 @@ from geomoe3d.cli.errors import (
     renamed_verb,
     traceback_option,
 )
+from geomoe3d.cli.parts import Number, Option
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
     from geomoe3d.data.check import CheckReport
     from geomoe3d.types import FloatArray
 
-_min_overlap = click.option(
-    "--min-overlap",
-    default=0.1,
-    show_default=True,
-    type=click.FloatRange(0, 1),
-    help="Least overlap of a pair that is listed.",
+
+def _number(name: str, metavar: str, default: float, kind: Number, text: str) -> Option:
+    return click.option(name, metavar=metavar, default=default, show_default=True, type=kind, help=text)
+
+
+_workers = _number("--workers", "N", 1, Number(1), "Processes.")
+_min_overlap = _number(
+    "--min-overlap", "SHARE", 0.1, Number(0, 1, whole=False), "Least overlap of a pair that is listed."
 )
 
 
@@ -98,13 +101,18 @@ def _print(report: CheckReport) -> None:
 @command.command(cls=Verb, context_settings=HELP, short_help="Fuse depth frames into fragments.")
 @click.argument("frames", type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option("--count", default=50, show_default=True, help="Number of frames fused into one fragment.")
-@click.option("--voxel-size", default=0.006, show_default=True, help="Edge of the fusion grid, metres.")
-@click.option("--max-depth", default=6.0, show_default=True, help="Greater depths are not used, metres.")
+@_number("--count", "N", 50, Number(1), "Number of frames fused into one fragment.")
+@_number("--voxel-size", "LENGTH", 0.006, Number(above=0, whole=False), "Edge of the fusion grid, metres.")
+@_number("--max-depth", "LENGTH", 6.0, Number(above=0, whole=False), "Greater depths are not used, metres.")
 @click.option(
     "--whole", is_flag=True, help="Keep points outside the 3 m cube to which 3DMatch cut its fragments."
 )
-@click.option("--grid", type=float, help="Keep one point per cell of this edge, metres (default: all).")
+@click.option(
+    "--grid",
+    metavar="LENGTH",
+    type=Number(above=0, whole=False),
+    help="Keep one point per cell of this edge, metres (default: all).",
+)
 @_min_overlap
 @click.option(
     "--convention",
@@ -116,10 +124,16 @@ def _print(report: CheckReport) -> None:
     metavar="FX,FY,CX,CY",
     help="Focal lengths and centre, pixels (default: the folder's file).",
 )
-@click.option("--depth-unit", type=float, help="Depth values per metre (default: 1000, TUM 5000).")
+@click.option(
+    "--depth-unit",
+    metavar="NUMBER",
+    type=Number(above=0, whole=False),
+    help="Depth values per metre (default: 1000, TUM 5000).",
+)
 @click.option(
     "--invalid",
-    type=int,
+    metavar="N",
+    type=Number(0),
     multiple=True,
     help="Depth value that means none (default: 0 and 65535); repeatable.",
 )
@@ -194,22 +208,20 @@ def _intrinsics(text: str) -> FloatArray:
 @click.argument("out", type=click.Path())
 @click.argument("bare", nargs=-1, metavar="")
 @click.option("--set", "assignments", metavar="KEY=VALUE", multiple=True, help="One setting; repeatable.")
-@click.option("--scenes", required=True, type=click.IntRange(min=1), help="Scenes of the set.")
-@click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
-@click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Another seed, another set."
-)
+@click.option("--scenes", required=True, metavar="N", type=Number(1), help="Scenes of the set.")
+@_workers
+@_number("--seed", "N", 0, Number(0), "Another seed, another set.")
 @click.option(
     "--models",
     "model_folders",
     multiple=True,
-    type=click.Path(),
+    metavar="FOLDER",
     help="Folder of furniture models; repeatable.",
 )
 @click.option(
-    "--mesh", "meshes", multiple=True, type=click.Path(), help="Whole scene to walk through; repeatable."
+    "--mesh", "meshes", multiple=True, metavar="FILE", help="Whole scene to walk through; repeatable."
 )
-@click.option("--config", type=click.Path(), help="YAML file of settings (see configs/data).")
+@click.option("--config", metavar="FILE", help="YAML file of settings (see configs/data).")
 @click.option("--show", is_flag=True, help="Print the complete settings and stop.")
 @traceback_option
 def synthesize(
@@ -255,22 +267,30 @@ def synthesize(
 @command.command(cls=Verb, context_settings=HELP, short_help="Compute the features of fragments once.")
 @click.argument("root", type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option("--group", "groups", multiple=True, help="List of pairs to take, e.g. train_info; repeatable.")
-@click.option("--scene", "scenes", multiple=True, help="Scene to take (default: all); repeatable.")
+@click.option(
+    "--group",
+    "groups",
+    metavar="NAME",
+    multiple=True,
+    help="List of pairs to take, e.g. train_info; repeatable.",
+)
+@click.option(
+    "--scene", "scenes", metavar="NAME", multiple=True, help="Scene to take (default: all); repeatable."
+)
 @click.option(
     "--split",
     type=click.Choice(("train", "validation", "test")),
     help="Take the scenes of a published split of 3DMatch alone (default: all scenes).",
 )
 @_min_overlap
-@click.option(
+@_number(
     "--voxel-size",
-    default=0.05,
-    show_default=True,
-    type=click.FloatRange(min=0, min_open=True),
-    help="Edge of a voxel, in the unit of the fragments.",
+    "LENGTH",
+    0.05,
+    Number(above=0, whole=False),
+    "Edge of a voxel, in the unit of the fragments.",
 )
-@click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
+@_workers
 @traceback_option
 @click.pass_context
 def features(
@@ -308,9 +328,7 @@ def features(
 @command.command(cls=Verb, context_settings=HELP, short_help="Match photographs with cameras, to train on.")
 @click.argument("scenes", nargs=-1, required=True, type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option(
-    "--pairs", default=1000, show_default=True, type=click.IntRange(min=2), help="Per scene, at most."
-)
+@_number("--pairs", "N", 1000, Number(2), "Per scene, at most.")
 @click.option("--leave-out", metavar="NAME", multiple=True, help="Scene to validate on alone; repeatable.")
 @traceback_option
 def images(scenes: tuple[str, ...], out: str, pairs: int, leave_out: tuple[str, ...]) -> None:
@@ -335,12 +353,10 @@ def images(scenes: tuple[str, ...], out: str, pairs: int, leave_out: tuple[str, 
 @click.argument("features", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option(
-    "--pairs", required=True, type=click.IntRange(min=1), help="Pairs to draw, rounded up to whole hundreds."
+    "--pairs", required=True, metavar="N", type=Number(1), help="Pairs to draw, rounded up to whole hundreds."
 )
-@click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Another seed, other pairs."
-)
-@click.option("--workers", default=1, show_default=True, type=click.IntRange(min=1), help="Processes.")
+@_number("--seed", "N", 0, Number(0), "Another seed, other pairs.")
+@_workers
 @traceback_option
 @click.pass_context
 def transforms(context: click.Context, features: str, out: str, pairs: int, seed: int, workers: int) -> None:

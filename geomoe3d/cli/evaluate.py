@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geomoe3d.cli.errors import HELP, ExitCode, Verb, command_line, traceback_option
-from geomoe3d.cli.parts import method_part_options, together
+from geomoe3d.cli.parts import Number, method_part_options, together
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
@@ -48,11 +48,14 @@ _prediction_options = together(
         show_default=True,
         help="Input: 1k or all (fixed correspondences), or clouds (end to end).",
     ),
-    click.option("--every", metavar="N", default=1, show_default=True, help="Use every n-th pair only."),
+    click.option(
+        "--every", metavar="N", type=Number(1), default=1, show_default=True, help="Use every n-th pair only."
+    ),
     click.option(
         "--unrelated",
         "num_unrelated",
         metavar="N",
+        type=Number(0),
         default=200,
         show_default=True,
         help="Number of pairs of the benchmark unrelated.",
@@ -70,11 +73,19 @@ _prediction_options = together(
     click.option(
         "--workers",
         metavar="N",
+        type=Number(1),
         default=1,
         show_default=True,
         help="Processes; with two or more, a method that crashes loses one pair only.",
     ),
-    click.option("--seed", metavar="N", default=0, show_default=True, help="Random seed of the methods."),
+    click.option(
+        "--seed",
+        metavar="N",
+        type=Number(0),
+        default=0,
+        show_default=True,
+        help="Random seed of the methods.",
+    ),
     click.option("--fresh", is_flag=True, help="Remove the stored answers of these runs first."),
 )
 
@@ -175,22 +186,24 @@ def methods() -> None:
 
 @command.command(cls=Verb, context_settings=HELP, short_help="Measure poses or homographies of photographs.")
 @click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=click.Path(exists=True))
-@click.option("--weights", type=click.Path(), help="Network that weighs matches (.safetensors).")
+@click.option("--weights", metavar="FILE", help="Network that weighs matches (.safetensors).")
 @click.option(
     "--pairs",
+    metavar="N",
     default=200,
     show_default=True,
-    type=click.IntRange(min=2),
+    type=Number(2),
     help="Per scene, at most: half turned by 3 to 20 degrees, half by 20 to 60; or warps, two an image.",
 )
 @click.option("--homographies", is_flag=True, help="Homographies in place of poses.")
-@click.option("--images", type=click.Path(), help="Where the images of a list of pairs lie.")
+@click.option("--images", metavar="FOLDER", help="Where the images of a list of pairs lie.")
 @click.option(
     "--keep",
+    metavar="FOLDER",
     type=click.Path(file_okay=False),
     help="Folder that keeps each finished pair: the same call goes on where it was stopped.",
 )
-@click.option("--output", type=click.Path(), help="Write all errors as JSON.")
+@click.option("--output", metavar="FILE", help="Write all errors as JSON.")
 @click.option("--force", is_flag=True, help="Replace a file that exists.")
 @traceback_option
 def images(

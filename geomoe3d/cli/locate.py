@@ -12,7 +12,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option, use_instead
 from geomoe3d.cli.files import check_outputs, is_map, part_option
-from geomoe3d.cli.parts import configuration_options, sensor_place, unit_option
+from geomoe3d.cli.parts import Number, configuration_options, sensor_place, unit_option
 from geomoe3d.runtime.words import of_the_score
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ Form = Literal["text", "json", "quiet"]
     "-k",
     "--places",
     metavar="N",
-    type=click.IntRange(1),
+    type=Number(1),
     default=3,
     show_default=True,
     help="Most candidate places to list.",
@@ -42,7 +42,10 @@ Form = Literal["text", "json", "quiet"]
     "--sensor) where its middle lies.",
 )
 @click.option(
-    "--within", type=float, metavar="LENGTH", help="How far off --near may be, in the unit of the map."
+    "--within",
+    type=Number(above=0, whole=False),
+    metavar="LENGTH",
+    help="How far off --near may be, in the unit of the map.",
 )
 @click.option(
     "--initial", metavar="FILE", help="A first guess of the transform, as of `register`; one scan only."

@@ -9,7 +9,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import part_option
-from geomoe3d.cli.parts import cache_options, configuration_options, worker_options
+from geomoe3d.cli.parts import Number, cache_options, configuration_options, worker_options
 from geomoe3d.multiway.defaults import ALL_PAIRS_UP_TO, MOST_ROUNDS, NEIGHBORS
 from geomoe3d.runtime.words import counted
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--neighbors",
-    type=click.IntRange(1),
+    type=Number(1),
     default=NEIGHBORS,
     metavar="N",
     help=f"Pairs tried per scan, twice as many in each further round. [{NEIGHBORS}]",
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 @click.option(
     "--model-voxel-size",
     "merged_voxel_size",
-    type=float,
+    type=Number(above=0, whole=False),
     metavar="LENGTH",
     help="Edge of a voxel of the merged cloud. [that of the scans]",
 )
 @click.option(
     "--rounds",
-    type=click.IntRange(0),
+    type=Number(0),
     default=MOST_ROUNDS,
     metavar="N",
     help=f"Rounds of further pairs for scans that are not connected yet. [{MOST_ROUNDS}]",
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 @click.option(
     "--initial-error",
     nargs=2,
-    type=float,
+    type=Number(above=0, whole=False),
     metavar="LENGTH DEGREES",
     help="Standard deviation of the transform between two scans by these poses. [2 voxels, 2 degrees]",
 )
@@ -102,8 +102,6 @@ def command(
 
     if len(inputs) < 2:
         raise click.UsageError("give at least one folder of scans, or two scans, and OUT last")
-    if merged_voxel_size is not None and not merged_voxel_size > 0:
-        raise click.UsageError(f"--model-voxel-size must be positive, found {merged_voxel_size}")
     from geomoe3d.multiway.run import register_scans
 
     with stdout_to_stderr(), progress_bar("pairs", quiet=quiet) as progress:

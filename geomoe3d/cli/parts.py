@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
@@ -18,6 +19,45 @@ _PARTS = (
     ("estimator", "estimator.name", "What proposes transforms: consensus, ransac or svd. [consensus]"),
     ("refiner", "refinement.name", "What refines them: gicp, icp, svd or none. [gicp]"),
 )
+
+
+class Number(click.ParamType):  # type: ignore[type-arg]  # older click has no such arguments
+    """A finite number within limits, which an error says in words; help shows the metavar alone."""
+
+    def __init__(
+        self,
+        least: float | None = None,
+        most: float | None = None,
+        *,
+        above: float | None = None,
+        whole: bool = True,
+    ) -> None:
+        self.least, self.most, self.above, self.whole = least, most, above, whole
+        self.name = "n" if whole else "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number that a text is; fails with what is allowed."""
+        try:
+            found = int(value) if self.whole else float(value)
+        except ValueError:
+            found = math.nan
+        least, most, above = (x if x is not None else y for x, y in (
+            (self.least, -math.inf), (self.most, math.inf), (self.above, -math.inf)))  # fmt: skip
+        if math.isfinite(found) and least <= found <= most and (found > above or self.above is None):
+            return found
+        limits = [
+            f"{word} {limit:.17g}"
+            for word, limit in (
+                ("at least", self.least),
+                ("at most", self.most),
+                ("greater than", self.above),
+            )
+            if limit is not None
+        ]
+        allowed = ", ".join(["a whole number" if self.whole else "a number", " and ".join(limits)]).rstrip(
+            ", "
+        )
+        return self.fail(f"'{value}' is not allowed here; give {allowed}", param, ctx)
 
 
 def together(*options: Option, then: Callable[[dict[str, Any]], None] = lambda named: None) -> Option:
@@ -52,7 +92,7 @@ def _all_that_fit(named: dict[str, Any]) -> None:
 worker_options = together(
     click.option(
         "--workers",
-        type=click.IntRange(1),
+        type=Number(1),
         metavar="N",
         help="Parallel processes on this machine. [as many as cores and memory allow]",
     ),

@@ -11,7 +11,7 @@ import click
 
 from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option
 from geomoe3d.cli.files import check_outputs
-from geomoe3d.cli.parts import Option, together
+from geomoe3d.cli.parts import Number, Option, together
 from geomoe3d.runtime.words import counted
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def _shared(estimators: tuple[str, ...], threshold: str) -> Option:
         click.option("--detector", default="rootsift", show_default=True,
                      type=click.Choice(("rootsift", "sift", "orb")), help="What finds keypoints."),
         click.option("--keypoints", metavar="N", default=2000, show_default=True,
-                     type=click.IntRange(8, 100_000), help="Most keypoints of an image."),
+                     type=Number(8, 100_000), help="Most keypoints of an image."),
         click.option("--matches", type=click.Choice(("distinct", "loose", "mutual", "all")),
                      help="Which nearest neighbours go to the estimator: mutual ones that pass the ratio test "
                      "at 0.8 or, loosely, at 0.95, all mutual ones, or all. [distinct; loose with --weights]"),
@@ -36,9 +36,9 @@ def _shared(estimators: tuple[str, ...], threshold: str) -> Option:
                      help="Network that rejects wrong matches (.safetensors, see configs/train/images)."),
         click.option("--estimator", default="magsac", show_default=True, type=click.Choice(estimators),
                      help="What fits the matches that are right and rejects the others."),
-        click.option("--threshold", metavar="PIXELS", type=click.FloatRange(min=0, min_open=True),
+        click.option("--threshold", metavar="PIXELS", type=Number(above=0, whole=False),
                      help=f"Inlier threshold. [{threshold}]"),
-        click.option("--seed", metavar="N", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1),
+        click.option("--seed", metavar="N", default=0, show_default=True, type=Number(0, 2**31 - 1),
                      help="Random seed: the same seed, the same answers."),
         click.option("--output", metavar="FILE.json", help="Write the answer as JSON."),
         click.option("--picture", metavar="FILE", help="Draw the matches: .png, .jpg, .webp, .pdf or .svg."),

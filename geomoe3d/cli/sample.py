@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from geomoe3d.cli.errors import HELP, Verb, traceback_option
+from geomoe3d.cli.parts import Number
 
 
 @click.command(cls=Verb, context_settings=HELP)
@@ -12,7 +13,7 @@ from geomoe3d.cli.errors import HELP, Verb, traceback_option
 @click.option(
     "--seed",
     metavar="N",
-    type=int,
+    type=Number(0),
     default=0,
     show_default=True,
     help="Random seed; another seed gives another pair.",

@@ -24,7 +24,7 @@ PACKAGE = ROOT / "geomoe3d"
 KINDS = {
     "of a file format, a protocol, a published data set or a version": (
         "data/splits.py:* data/fusion.py:*",
-        "*:*VERSION *:_NO_DATA batch/run.py:ALL_THAT_FIT",
+        "*:*VERSION *:_NO_DATA",
     ),
     "of mathematics, physics or rounding: three points fix a motion, millimetres in a metre, what avoids 0 / 0": (
         "*:_BITS *:_BINS *:_TINY *:*_UNITS *:OFF_ROUND *:_MIN_POINTS *:_depth *:MIN_MATCHES *:_LOOSEST",

@@ -34,8 +34,6 @@ from geomoe3d.runtime.progress import Watch, shows_progress
 from geomoe3d.runtime.words import counted
 from geomoe3d.runtime.workers import DaskPool, Pool, ProcessPool, SerialPool, WorkerDied, run_surviving
 
-ALL_THAT_FIT = 0
-
 
 @dataclass(frozen=True)
 class BatchReport:

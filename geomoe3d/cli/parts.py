@@ -84,9 +84,7 @@ def together(*options: Option, then: Callable[[dict[str, Any]], None] = lambda n
 
 def _all_that_fit(named: dict[str, Any]) -> None:
     if named["workers"] is None and named["scheduler"] is None:
-        from geomoe3d.batch.run import ALL_THAT_FIT
-
-        named["workers"] = ALL_THAT_FIT
+        named["workers"] = 0  # as many as fit
 
 
 worker_options = together(

@@ -128,8 +128,10 @@ def test_json_and_inverse_keep_it_and_old_results_have_none() -> None:
 def test_the_words_name_each_figure() -> None:
     facts = dict(accuracy_facts(replace(room_view().result, accuracy=FOUND)))
     assert facts["overlap"] == "60 % of the source, 40 % of the target"
-    assert facts["inlier RMSE"] == "0.03"
-    assert facts["distance"] == "mean 0.01, median 0.008, standard deviation 0.007, 95 % within 0.025"
+    assert facts["matches"] == "RMSE 0.03, not the accuracy (that is the uncertainty)"
+    assert (
+        facts["surfaces"] == "distance mean 0.01, median 0.008, standard deviation 0.007, 95 % within 0.025"
+    )
     assert "4 and 12 mm if the unit is the metre" in facts["uncertainty"]
     assert "0.11 deg" in facts["uncertainty"]
     for factor in (1e3, 1e-9):  # not metres: no word of millimetres, above all not of a million of them
@@ -141,7 +143,7 @@ def test_the_words_name_each_figure() -> None:
     none = dict(
         accuracy_facts(replace(room_view().result, accuracy=replace(FOUND, inlier_rmse=float("nan"))))
     )
-    assert none["inlier RMSE"] == "none: no correspondence is an inlier"
+    assert none["matches"] == "none is an inlier"
     assert dict(accuracy_facts(room_view().result)) == {"overlap": "60 % of the source"}
 
 

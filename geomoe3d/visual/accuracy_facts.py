@@ -38,10 +38,9 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
             "overlap",
             f"{100 * found.overlap_source:.0f} % of the source, {100 * found.overlap_target:.0f} % of the target",
         ),
-        ("inlier RMSE", _rmse(found.inlier_rmse, unit)),
         (
-            "distance",
-            f"mean {found.distance_mean:.3g}, median {found.distance_median:.3g}, standard deviation "
+            "surfaces",
+            f"distance mean {found.distance_mean:.3g}, median {found.distance_median:.3g}, standard deviation "
             f"{found.distance_std:.3g}, 95 % within {length(found.distance_p95, unit, '.3g')}",
         ),
         (
@@ -49,6 +48,7 @@ def accuracy_facts(result: RegistrationResult, unit: str = "") -> list[tuple[str
             f"{held}: {length(near, unit, '.3g')} at the overlap's centre, {length(far, unit, '.3g')} at the farthest "
             f"point, {found.sigma_rotation_deg:.2g} deg{metres if unit in ('', 'm') else ''}",
         ),
+        ("matches", _rmse(found.inlier_rmse, unit)),
     ]
 
 
@@ -69,7 +69,9 @@ def margin_facts(result: RegistrationResult) -> list[tuple[str, str]]:
 
 
 def _rmse(value: float, unit: str) -> str:
-    return length(value, unit, ".3g") if np.isfinite(value) else "none: no correspondence is an inlier"
+    if not np.isfinite(value):
+        return "none is an inlier"
+    return f"RMSE {length(value, unit, '.3g')}, not the accuracy (that is the uncertainty)"
 
 
 def _scale(result: RegistrationResult) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from geomoe3d.clouds.inputs import NOT_KEPT, Inputs
 from geomoe3d.errors import InputError
-from geomoe3d.runtime.plain import plain
+from geomoe3d.runtime.plain import parse_json, plain
 from geomoe3d.types import Accuracy, Alternative, BoolArray, CloudReport, FloatArray
 
 if TYPE_CHECKING:
@@ -349,7 +349,7 @@ class RegistrationResult:
             InputError: the text is no registration result.
         """
         try:
-            data = json.loads(text)
+            data = parse_json(text)
             data["T_target_source"] = _array(data["T_target_source"], (4, 4))
             data["information_matrix"] = _array(data["information_matrix"], (6, 6))
             data["information_center"] = _array(data["information_center"], (3,))

@@ -332,8 +332,8 @@ class Accuracy:
     are smaller and 95 in 100 smaller than twice that (docs/measurements.md). Of a wrong answer they say nothing.
 
     Attributes:
-        inlier_rmse: root mean square residual of the correspondences that agree with the transform: how rough matches of
-            single points are, and no accuracy of the transform.
+        inlier_rmse: root mean square residual of the correspondences that agree with the transform: how rough matches
+            of single points are, and no accuracy of the transform.
         overlap_source: share of source points with a target point within the inlier threshold.
         overlap_target: share of target points with a source point within the inlier threshold.
         distance_mean, distance_median, distance_std, distance_p95: mean, median, standard deviation and 95 %

@@ -16,6 +16,7 @@ from typing import Any
 
 from geomoe3d.errors import GeoMoE3DError
 from geomoe3d.runtime.files import file_hash, write_text
+from geomoe3d.runtime.plain import parse_json
 
 CONTENTS_MARK = '"geomoe3d batch files 1"'
 
@@ -78,7 +79,7 @@ class Contents:
             self._kept = {}
             if self._file is not None and self._file.is_file():
                 try:
-                    kept = json.loads(self._file.read_text(encoding="utf-8"))["files"]
+                    kept = parse_json(self._file.read_text(encoding="utf-8"))["files"]
                     self._kept = {
                         path: entry for path, entry in kept.items() if isinstance(entry, list) and entry
                     }

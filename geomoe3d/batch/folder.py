@@ -7,7 +7,6 @@ not a batch's own is never replaced nor removed: it is refused before work begin
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,6 +19,7 @@ from geomoe3d.errors import FormatError, InputError, OutputError
 from geomoe3d.result import RegistrationResult
 from geomoe3d.runtime.files import make_folder, refusals, remove
 from geomoe3d.runtime.journal import Journal
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.words import counted
 
 RUN_FILE, JOURNAL_FILE = "run.json", "journal.jsonl"
@@ -42,7 +42,7 @@ def read_identity(folder: Path) -> dict[str, Any] | None:
     its ``run.json`` is damaged, or of something else."""
     path = folder / RUN_FILE
     try:
-        identity = dict(json.loads(path.read_text(encoding="utf-8"))["identity"])
+        identity = dict(parse_json(path.read_text(encoding="utf-8"))["identity"])
         if str(identity.get("format")).startswith(_KIND):
             return identity
         found = f"its format is {identity.get('format')!r}"

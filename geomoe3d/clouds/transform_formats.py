@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from geomoe3d.config.reading import parse_yaml
 from geomoe3d.errors import FormatError, plain_reason
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import FloatArray
 
@@ -105,7 +107,7 @@ def parse_transform(text: str) -> FloatArray:
     nothing that is understood, or more than one transform; InputError: a result without a transform."""
     if text.lstrip()[:1] in ("{", "["):
         try:
-            return _of_document(json.loads(text))
+            return _of_document(parse_json(text))
         except json.JSONDecodeError:
             if text.lstrip()[0] == "{":
                 raise
@@ -116,7 +118,7 @@ def parse_transform(text: str) -> FloatArray:
         import yaml
 
         try:
-            return _of_document(yaml.safe_load(text))
+            return _of_document(parse_yaml(text))
         except yaml.YAMLError as error:
             raise FormatError(f"no YAML: {' '.join(str(error).split())}") from None
     remarks = " ".join(re.findall(r"(?:#|//)(.*)", text))

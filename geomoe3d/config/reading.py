@@ -61,6 +61,18 @@ def build_config(section: type[S], tree: dict[str, Any] | None, where: str = "co
         raise ConfigError(f"{where}: {_explain(error, section)}") from None
 
 
+def parse_yaml(text: str) -> Any:
+    """As `yaml.safe_load`. Raises yaml.YAMLError: the text is no YAML, or is nested too deeply."""
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except RecursionError:
+        raise yaml.YAMLError("its brackets are nested too deeply") from None
+    except ValueError as error:  # such as the 45th of a month
+        raise yaml.YAMLError(str(error)) from None
+
+
 def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
     """Apply ``a.b=value`` strings (value parsed as YAML) to a copy of a nested mapping. Raises ConfigError:
     an assignment without ``=`` or through a key that is no section."""
@@ -81,7 +93,7 @@ def set_keys(tree: dict[str, Any], assignments: list[str]) -> dict[str, Any]:
                 raise ConfigError(f"'{assignment}': '{parent}' holds a value, not a section")
             node = child
         try:
-            node[leaf] = yaml.safe_load(text)
+            node[leaf] = parse_yaml(text)
         except yaml.YAMLError as error:
             raise ConfigError(f"'{assignment}': the value cannot be read ({plain_reason(error)})") from None
     return result
@@ -94,7 +106,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
     try:
         text = _shipped(Path(path)).read_text(encoding="utf-8")
-        tree = yaml.safe_load(text)
+        tree = parse_yaml(text)
         twice = _twice(yaml.compose(text, yaml.SafeLoader))
     except FileNotFoundError as error:
         names = [str(file.relative_to(_CONFIGS.parent)) for file in sorted(_CONFIGS.rglob("*.yaml"))]

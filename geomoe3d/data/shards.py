@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from geomoe3d.errors import FormatError, InputError
 from geomoe3d.runtime.files import file_hash, new_folder
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.types import Float32Array, FloatArray
 
@@ -102,7 +103,7 @@ def read_meta(folder: str | Path) -> dict[str, Any]:
     """What a shard says about itself. Raises FormatError: shard.json is missing or damaged."""
     path = Path(folder) / _META
     try:
-        meta = json.loads(path.read_text())
+        meta = parse_json(path.read_text())
     except (OSError, ValueError) as error:
         raise FormatError(f"shard '{folder}' has no readable {_META}: {error}") from None
     if not isinstance(meta, dict) or "version" not in meta:

@@ -28,6 +28,7 @@ from geomoe3d.data.settings import GENERATOR_VERSION, SynthesisSettings
 from geomoe3d.data.threedmatch import write_gt_log, write_gt_overlap
 from geomoe3d.errors import InputError, OutputError
 from geomoe3d.runtime.files import make_folder, new_folder, refusals, write_text
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 
@@ -199,7 +200,7 @@ def read_summary(folder: Path) -> SceneSummary:
     """Summary of a scene that is there. Raises InputError: scene.json is missing or damaged; removing the
     scene's folder makes it anew."""
     try:
-        return SceneSummary(**json.loads((folder / "scene.json").read_text()))
+        return SceneSummary(**parse_json((folder / "scene.json").read_text()))
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"'{folder}' is damaged ({error}); remove it and run again") from None
 
@@ -258,7 +259,7 @@ def _open_folder(folder: Path, manifest: dict[str, Any]) -> None:
         path = folder / MANIFEST
         if path.is_file():
             try:
-                found = json.loads(path.read_text())
+                found = parse_json(path.read_text())
             except ValueError as error:
                 raise InputError(f"'{path}' is damaged ({error}); give a new folder") from None
             differing = differences(_completed(found), manifest)

@@ -21,6 +21,7 @@ from geomoe3d.errors import FormatError, InputError, plain_reason
 from geomoe3d.evaluation.records import Labels, Prediction, RunInfo
 from geomoe3d.runtime.files import make_folder, remove, write_text
 from geomoe3d.runtime.journal import Journal, read_journal
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.provenance import differences, in_words
 from geomoe3d.types import BoolArray, FloatArray
 
@@ -84,7 +85,7 @@ def read_info(folder: Path) -> RunInfo:
     """What a run says of itself. Raises FormatError: run.json is damaged."""
     path = folder / RUN_FILE
     try:
-        return RunInfo(**json.loads(path.read_text(encoding="utf-8")))
+        return RunInfo(**parse_json(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
         raise FormatError(f"'{path}' does not describe a run: {error}") from None
 

@@ -26,6 +26,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.features.base import Descriptor
 from geomoe3d.runtime.files import make_folder, write_atomically
 from geomoe3d.runtime.home import ensure_home, folder_for
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.sources import library_versions, source_closure, source_hash
 from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
@@ -177,7 +178,7 @@ def _read(path: Path) -> PreparedCloud | None:
     try:
         with np.load(path, allow_pickle=False) as archive:  # a zip file: every array has its checksum
             points, normals, features = archive["points"], archive["normals"], archive["features"]
-            viewpoint, facts = archive["viewpoint"], json.loads(str(archive["facts"]))
+            viewpoint, facts = archive["viewpoint"], parse_json(str(archive["facts"]))
         if not len(points) == len(normals) == len(features):
             raise ValueError("its arrays differ in length")
         cloud = PreparedCloud(

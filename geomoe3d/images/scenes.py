@@ -7,7 +7,6 @@ text and binary models, Middlebury's NAME_par.txt, and what OANet and those who 
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,11 +15,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomoe3d.errors import FormatError, InputError, MissingFileError
+from geomoe3d.errors import FormatError, InputError, MissingFileError, plain_reason
 from geomoe3d.geometry.se3 import check_motion, inverse, make_transform
 from geomoe3d.images.cameras import Camera, ImageScene, View
 from geomoe3d.images.features import read_grey
 from geomoe3d.runtime.optional import optional_module
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.words import counted, natural_key, shape_in_words
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".tif", ".tiff")
@@ -52,7 +52,9 @@ def read_scene(folder: str | Path) -> ImageScene:
     except (FormatError, MissingFileError):
         raise
     except (InputError, ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
-        raise FormatError(f"'{file}' is damaged, or no file of the layout {layout}: {error}") from None
+        raise FormatError(
+            f"'{file}' is damaged, or no file of the layout {layout}: {plain_reason(error)}"
+        ) from None
     lost = len(views) - len(there)
     notes = (f"{lost} of {len(views)} views have no image",) if lost else ()
     if len(there) < 2:
@@ -78,7 +80,7 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def _transforms(folder: Path, file: Path) -> Iterator[View]:
-    data = json.loads(file.read_text(encoding="utf-8"))
+    data = parse_json(file.read_text(encoding="utf-8"))
     for frame in data["frames"]:
         given: dict[str, Any] = {**data, **frame}
         path = folder / given["file_path"]

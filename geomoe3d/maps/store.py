@@ -26,6 +26,7 @@ from geomoe3d.maps.level import Level
 from geomoe3d.maps.pieces import Pieces
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.runtime.files import write_atomically
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.types import FloatArray
 
 VERSION = 4
@@ -128,7 +129,7 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, t
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
-            told = json.loads(str(archive["told"]))
+            told = parse_json(str(archive["told"]))
             if told["geomoe3d map"] > VERSION:
                 raise FormatError(
                     f"'{path}' was written by a later version of geomoe3d (map version {told['geomoe3d map']}, known "

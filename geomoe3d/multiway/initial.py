@@ -21,6 +21,7 @@ from geomoe3d.config import expert
 from geomoe3d.errors import FormatError, InputError, plain_reason
 from geomoe3d.geometry.se3 import check_motion, inverse, shift_frames
 from geomoe3d.multiway.edges import Edge, Shape
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.words import counted, shape_in_words
 from geomoe3d.types import FloatArray
 
@@ -136,7 +137,7 @@ def _of_text(text: str) -> list[FloatArray]:
 
 def _of_json(text: str, names: Sequence[str]) -> list[FloatArray]:
     try:
-        data = json.loads(text, parse_int=float)  # however many digits
+        data = parse_json(text, parse_int=float)  # however many digits
     except json.JSONDecodeError as error:
         raise FormatError(f"no JSON: line {error.lineno}, column {error.colno}: {error.msg}") from None
     if isinstance(data, dict) and "groups" in data and not all(name in data for name in names):

@@ -31,6 +31,7 @@ from geomoe3d.multiway.tables import (
     scans_text,
 )
 from geomoe3d.runtime.files import remove, write_text
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
 
@@ -275,7 +276,7 @@ def check_folder(folder: Path, inputs: Iterable[str | os.PathLike[str]], *, page
 def is_model(folder: Path) -> bool:
     """Whether the poses in a folder are those of a model of this package."""
     try:
-        stored = json.loads((folder / POSES_FILE).read_text(encoding="utf-8"))
+        stored = parse_json((folder / POSES_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     return isinstance(stored, dict) and str(stored.get("format")).startswith(_KIND)

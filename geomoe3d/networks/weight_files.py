@@ -7,7 +7,6 @@ hash, architecture or tensors do not fit is refused.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from geomoe3d.config import build_config
 from geomoe3d.errors import CheckpointError, ConfigError, MissingWeightsError
 from geomoe3d.networks.architecture import NetworkConfig
 from geomoe3d.runtime.files import file_hash
+from geomoe3d.runtime.plain import parse_json
 
 PACKAGED = Path(__file__).parent / "weights"
 DEFAULT_WEIGHTS = "geomoe3d"
@@ -75,7 +75,7 @@ def judges_transforms(name_or_path: str | Path) -> bool:
     Raises CheckpointError: no such weights."""
     card = find_weights(name_or_path).with_suffix(".json")
     try:
-        architecture = json.loads(card.read_text(encoding="utf-8"))["architecture"]
+        architecture = parse_json(card.read_text(encoding="utf-8"))["architecture"]
         return "aligned" in architecture.get("extra_channels", ())
     except (OSError, ValueError, KeyError, AttributeError, TypeError):
         return False  # loading the weights says what is wrong with the card
@@ -120,12 +120,12 @@ def read_card(path: str | Path) -> WeightCard:
     """The card beside a weight file. Raises CheckpointError: missing, unreadable, or of another format or version."""
     place = card_path(Path(path))
     try:
-        values = json.loads(place.read_text(encoding="utf-8"))
+        values = parse_json(place.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise MissingWeightsError(
             f"'{path}' has no card: '{place}' is missing; keep both files together"
         ) from None
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"card '{place}' cannot be read: {error}") from None
     if not isinstance(values, dict) or values.pop("format", None) != CARD_FORMAT:
         raise CheckpointError(f"'{place}' is no card of geomoe3d weights")

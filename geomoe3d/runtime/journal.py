@@ -17,6 +17,7 @@ from typing import IO, Any
 
 from geomoe3d.errors import FormatError, OutputError, cannot_read
 from geomoe3d.runtime.files import refusals
+from geomoe3d.runtime.plain import parse_json
 
 
 def read_journal(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
@@ -40,7 +41,7 @@ def read_journal(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
             if not line.endswith(b"\n"):
                 return
             try:
-                record = json.loads(line)
+                record = parse_json(line)
             except ValueError:
                 record = None
             if not isinstance(record, dict):

@@ -24,6 +24,7 @@ from geomoe3d.estimators.consensus import ConsensusEstimator
 from geomoe3d.estimators.keypoint_alignment import KeypointAligner
 from geomoe3d.estimators.proposals import propose
 from geomoe3d.runtime.files import make_folder, write_text
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.runtime.workers import ProcessPool, SerialPool, WorkerDied, run_surviving
 from geomoe3d.training.config import RULES
 from geomoe3d.training.fragment_pairs import as_training_pair
@@ -104,7 +105,7 @@ def _check_identity(path: Path, wanted: dict[str, Any]) -> None:
         write_text(path, json.dumps(wanted) + "\n", force=False)
         return
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = parse_json(path.read_text(encoding="utf-8"))
     except ValueError:
         found = {}
     differs = [key for key in wanted if found.get(key) != wanted[key]]

@@ -23,6 +23,7 @@ from geomoe3d.clouds.formats.raw import RawCloud, scale_colors
 from geomoe3d.clouds.formats.registry import reader
 from geomoe3d.errors import EmptyCloudError, FormatError, plain_reason
 from geomoe3d.geometry.se3 import transform_points
+from geomoe3d.runtime.plain import parse_json
 from geomoe3d.types import FloatArray, IntArray
 
 _UNDERSTOOD = (  # extensions that change no position, and quantisation, which `_Document.array` honours
@@ -268,7 +269,7 @@ def read_chunks(path: Path) -> tuple[dict[str, Any], bytes]:
         head = data[20 + size : 28 + size]
         if len(head) == 8 and head[4:] == b"BIN\0":
             binary = data[28 + size : 28 + size + struct.unpack("<I", head[:4])[0]]
-    content = json.loads(text)
+    content = parse_json(text)
     if not isinstance(content, dict) or not str(content.get("asset", {}).get("version", "")).startswith("2."):
         raise FormatError(f"'{path}' is no glTF 2.0 file: its JSON has no asset of version 2")
     return content, binary

@@ -125,3 +125,12 @@ def test_the_table_says_nothing_of_a_mix_that_changed_nothing(tmp_path) -> None:
         0,
     )
     assert "belong together" not in table(report)
+
+
+def test_ids_made_of_long_paths_are_shown_as_names_of_files(tmp_path) -> None:
+    store = BatchStore(tmp_path / "b", load_config(None, []))
+    folder = "/somewhere/far/down/in/a/tree/of/folders/with/long/names"
+    made = {"id": f"{folder}/a.ply+{folder}/b.ply", "error": "no such file", "result": None}
+    said = table(BatchReport(tmp_path, (store.outcome(made), store.outcome({**made, "id": "mine"})), 2, 0))
+    assert "  a.ply+b.ply  0.00  error           no such file" in said
+    assert "  mine         0.00" in said

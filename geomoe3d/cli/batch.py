@@ -93,10 +93,16 @@ def table(report: BatchReport) -> str:
     if doubtful:
         lines.append("")
     shown = doubtful[:20]
-    width = min(40, max((len(outcome.id) for outcome in shown), default=0))
-    for outcome in shown:
+    names = [_short(outcome.id) for outcome in shown]
+    width = min(40, max(map(len, names), default=0))
+    for outcome, name in zip(shown, names, strict=True):
         reason = outcome.error if outcome.result is None else "; ".join(outcome.result.reasons[:1])
-        lines.append(f"  {outcome.id:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
+        lines.append(f"  {name:{width}}  {outcome.confidence:.2f}  {outcome.status:14}  {reason}")
     if len(doubtful) > len(shown):
         lines.append(f"  and {len(doubtful) - len(shown):,} more that are not ok")
     return "\n".join(lines)
+
+
+def _short(name: str) -> str:
+    """An id made of long paths, as their last parts."""
+    return name if len(name) <= 60 else "+".join(Path(part).name for part in name.split("+"))

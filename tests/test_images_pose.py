@@ -10,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 from image_scenes import CAMERA, matches_of, texture
+from scipy.optimize import least_squares
 
 from geomoe3d.cli.main import geomoe3d
 from geomoe3d.errors import CheckpointError, GeoMoE3DError, InputError, MissingFileError
@@ -17,7 +18,7 @@ from geomoe3d.geometry.homography import weighted_dlt
 from geomoe3d.geometry.se3 import rotation_angle_deg, rotation_error_deg
 from geomoe3d.images.cameras import Camera
 from geomoe3d.images.features import detect, match, read_grey
-from geomoe3d.images.homography import corner_error, find_homography, map_points
+from geomoe3d.images.homography import corner_error, deviations, find_homography, map_points
 from geomoe3d.images.network import ImageNetwork
 from geomoe3d.images.pose import find_pose
 from geomoe3d.networks.architecture import NetworkConfig
@@ -173,6 +174,54 @@ def test_the_homography_of_clean_matches(estimator):
     np.testing.assert_allclose(found.H, H, atol=1e-6, rtol=1e-5)
     assert corner_error(found.H, H, (800, 600)) < 1e-4
     assert found.inliers.all()
+
+
+def noisy_fit(seed, corner, width, height, num=40, noise=0.7):
+    """H of matches with noise in one part of an image of 800 x 600, by least squares of what they are off."""
+    rng = np.random.default_rng(seed)
+    first = np.array(corner) + rng.uniform(0, 1, (num, 2)) * [width, height]
+    second = map_points(H, first) + rng.normal(0, noise, first.shape)
+    flat = least_squares(
+        lambda h: (map_points(np.append(h, 1.0).reshape(3, 3), first) - second).ravel(),
+        H.ravel()[:8],
+        x_scale="jac",
+    ).x
+    return np.append(flat, 1.0).reshape(3, 3), np.hstack([first, second])
+
+
+@pytest.mark.parametrize("part", [((0, 0), 800, 600), ((500, 100), 200, 300), ((50, 50), 700, 40)])
+def test_the_deviation_of_a_corner_is_that_of_many_repeated_fits(part):
+    corners = np.array([[0, 0], [799, 0], [799, 599], [0, 599.0]])
+    fits = [noisy_fit(seed, *part) for seed in range(200)]
+    off = np.array([map_points(found, corners) - map_points(H, corners) for found, _ in fits])
+    measured = np.sqrt((off**2).sum(axis=2).mean(axis=0))
+    told = np.sqrt(np.mean([deviations(found, x, corners) ** 2 for found, x in fits], axis=0))
+    np.testing.assert_allclose(told, measured, rtol=0.35)
+
+
+@pytest.mark.parametrize("estimator", ["ransac", "magsac", "dlt"])
+def test_inliers_in_a_small_part_of_the_image_are_not_called_sure_of_the_rest(estimator):
+    """All matches that agree are right, and what they say of the far corner is off by decimetres of the image."""
+    rng = np.random.default_rng(3)
+    everywhere = rng.uniform([0, 0], [800, 600], (80, 2))
+    small = rng.uniform([20, 20], [150, 110], (80, 2))
+    for first, status in ((everywhere, "ok"), (small, "low_confidence")):
+        pixels = np.hstack([first, map_points(H, first) + rng.normal(0, 0.7, first.shape)])
+        wrong = rng.uniform(0, [800, 600, 800, 600], (400, 4))
+        weights = np.concatenate([np.ones(80), np.zeros(400) if estimator == "dlt" else np.full(400, 0.5)])
+        found = find_homography(np.vstack([pixels, wrong]), weights=weights, estimator=estimator)
+        assert found.status == status
+        assert found.inliers[:80].mean() > 0.9
+        if status == "ok":
+            assert corner_error(found.H, H, (800, 600)) < 5.0
+        else:
+            assert any("or lie in a small part of the image" in reason for reason in found.reasons)
+
+
+def test_matches_that_fix_no_homography_have_no_deviation():
+    line = np.column_stack([np.arange(30.0), 2 * np.arange(30.0)] * 2)
+    assert np.isinf(deviations(np.eye(3), line, line[:2, :2])).all()
+    assert np.isinf(deviations(np.eye(3), line[:3], line[:2, :2])).all()
 
 
 def test_dlt_is_differentiable_and_degenerate_matches_fail():

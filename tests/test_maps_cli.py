@@ -7,16 +7,18 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
 from generated_buildings import AWAY, GRID, UTM, scanned, shift
 
 from geomoe3d import Map
-from geomoe3d.cli import index
+from geomoe3d.cli import index, locate
 from geomoe3d.cli.errors import ExitCode, run
 from geomoe3d.cli.main import geomoe3d as program
 from geomoe3d.errors import EmptyCloudError
+from geomoe3d.result import Status
 
 
 def ask(*words):
@@ -66,6 +68,20 @@ def test_quietly_one_scan_prints_its_matrix_and_what_is_not_ok_one_line(
     assert told.out == ""
     assert told.err.count("\n") == 1
     assert told.err.startswith("feet: ")
+    assert ask("locate", "scan.npy", *words[:-1]) == ExitCode.OK
+    assert "next" not in capfd.readouterr().out
+    assert ask("locate", "feet.npy", *words[:-1]) == ExitCode.NOT_SURE
+    alone = capfd.readouterr().out.splitlines()
+    status = alone[0].split(":")[0]
+    assert alone[-2:] == ["", f"next: {locate._NEXT[status.replace(' ', '_')]}"]
+    assert ask("locate", "scan.npy", "feet.npy", *words[:-1]) == ExitCode.NOT_SURE
+    assert capfd.readouterr().out.splitlines()[-1].startswith(f"next ({status}): ")
+    assert ask("locate", "feet.npy", *words[:-1], "--json") == ExitCode.NOT_SURE
+    assert json.loads(capfd.readouterr().out)["scan"] == "feet"
+
+
+def test_every_status_that_is_not_ok_has_its_next_step():
+    assert set(locate._NEXT) == {*get_args(Status)} - {"ok"}
 
 
 def test_lengths_are_printed_with_the_unit_that_is_named(house, scan, tmp_path, monkeypatch, capfd):

@@ -22,6 +22,16 @@ if TYPE_CHECKING:
 
 Form = Literal["text", "json", "quiet"]
 
+_NEXT = {
+    "low_confidence": "check the place before you use it; where the scanner stood, roughly (--near X,Y,Z --within "
+    "LENGTH), or a scan that sees more can make it sure",
+    "ambiguous": "where the scanner stood, roughly (--near X,Y,Z --within LENGTH), or a scan that sees more can tell "
+    "the places apart",
+    "failed": "make sure that the scan was taken in this map, and that both are in one unit; where the scanner stood "
+    "(--sensor X,Y,Z in the scan, --near X,Y,Z in the map) can help",
+}
+"""What to do, by status."""
+
 
 @click.command(cls=Verb, context_settings=HELP, short_help="Find scans in a map, and say how sure.")
 @click.argument("inputs", metavar="SCANS... MAP", nargs=-1, required=True)
@@ -145,6 +155,11 @@ def command(
         sure = sum(location is not None and location.ok for _, location in found)
         rate = len(scans) / max(time.monotonic() - begin, 1e-9)
         click.echo(f"{sure} of {len(scans)} ok; {rate:.2f} scans per second")
+    if form == "text":
+        doubted = {location.status for _, location in found if location is not None} & _NEXT.keys()
+        for number, status in enumerate(status for status in _NEXT if status in doubted):
+            named = f" ({status.replace('_', ' ')})" if len(scans) > 1 else ""
+            click.echo(f"{'' if number else chr(10)}next{named}: {_NEXT[status]}")
     if output is not None:
         _write(output, found, force)
     if any(location is None for _, location in found):

@@ -39,6 +39,7 @@ class HomographyRules(Section):
     threshold: float = Field(3.0, gt=0, description="pixels: inlier threshold unless one is given")
     least_inliers: int = Field(15, ge=4, description="with fewer a wrong homography finds as many")
     most_between_halves: float = Field(3.0, gt=0, description="inlier thresholds between what halves give")
+    most_deviation: float = Field(3.0, gt=0, description="inlier thresholds: deviation of a corner")
 
 
 class MeasureRules(Section):

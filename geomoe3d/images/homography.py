@@ -94,7 +94,41 @@ def _doubts(H: FloatArray, matches: FloatArray, inliers: FloatArray, threshold: 
         off = float(np.nan_to_num(np.abs(np.array(others) - corners), nan=np.inf).max())
         if off > HOMOGRAPHY.most_between_halves * threshold:
             reasons.append(f"half of the inliers alone move a corner of what is matched by {off:.0f} pixels")
+        limit = HOMOGRAPHY.most_deviation * threshold
+        if (spread := float(deviations(H, inliers, extent).max())) > limit:
+            reasons.append(
+                f"the inliers hold a corner of what is matched no closer than {spread:.0f} pixels (one standard "
+                f"deviation; {limit:.3g} are allowed): they are few, or lie in a small part of the image or nearly in "
+                "line"
+            )
     return reasons
+
+
+def deviations(H: FloatArray, matches: FloatArray, pixels: FloatArray) -> FloatArray:
+    """(M,) standard deviation, pixels, of where H puts pixels (M, 2), if it is the best fit of matches (N, 4) whose
+    errors are as large as their residuals; infinite where these do not fix H."""
+    scale = np.array([*[1 / np.abs(matches[:, :2]).max(initial=1.0)] * 2, 1.0] * 3)  # of the columns of H
+    residuals = map_points(H, matches[:, :2]) - matches[:, 2:]
+    variance = (residuals**2).sum() / max(2 * len(matches) - 8, 1)  # of one coordinate
+    rows = (_slopes(H, matches[:, :2]) * scale).reshape(-1, 9)
+    # H times a number is the same homography: that direction, the ninth, stands for none.
+    _, values, directions = np.linalg.svd(rows, full_matrices=False)
+    if len(values) < 9 or not values[7] > 1e-9 * values[0]:
+        return np.full(len(pixels), np.inf)
+    moved = (_slopes(H, pixels) * scale) @ (directions[:8] / values[:8, None]).T
+    found: FloatArray = np.sqrt(variance * (moved**2).sum(axis=(1, 2)))
+    return found
+
+
+def _slopes(H: FloatArray, pixels: FloatArray) -> FloatArray:
+    """(N, 2, 9) by how much pixels move under H with each of its numbers."""
+    points = np.column_stack([pixels, np.ones(len(pixels))])
+    share = points / (points @ H[2])[:, None]
+    none = np.zeros_like(share)
+    u, v = map_points(H, pixels).T
+    return np.stack(
+        [np.hstack([share, none, -u[:, None] * share]), np.hstack([none, share, -v[:, None] * share])], axis=1
+    )
 
 
 def map_points(H: FloatArray, pixels: FloatArray) -> FloatArray:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
+import shutil
 from dataclasses import replace
 from urllib.parse import unquote
 
@@ -15,6 +17,7 @@ from small_scans import SETTINGS, UTM
 
 from geomoe3d import register_scans
 from geomoe3d.batch.folder import short_transform_name
+from geomoe3d.cli.multiway import summary
 from geomoe3d.clouds.io import load_points
 from geomoe3d.clouds.loading import read_raw
 from geomoe3d.clouds.transform_files import load_transform
@@ -26,6 +29,7 @@ from geomoe3d.multiway.free_space import FreeSpace, told_by
 from geomoe3d.multiway.initial import read_poses
 from geomoe3d.multiway.loops import find_loops
 from geomoe3d.multiway.report import contradicted_steps
+from geomoe3d.multiway.scans import Scan, find_copies
 
 CONFIG = load_config(None, SETTINGS)
 
@@ -36,6 +40,31 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 def model(scanned_room, tmp_path_factory):
     files = [scanned_room[0] / f"scan_{k}.npy" for k in (0, 1, 2, 3)]
     return register_scans(files, tmp_path_factory.mktemp("model"), config=CONFIG, page=False, sequence=True)
+
+
+def test_a_scan_under_a_second_name_is_named_everywhere_and_both_are_placed(scanned_room, tmp_path):
+    files = [tmp_path / name for name in ("first.npy", "second.npy", "again.npy")]
+    for file, k in zip(files, (0, 1, 1), strict=True):
+        shutil.copy(scanned_room[0] / f"scan_{k}.npy", file)
+    said = []
+    made = register_scans(files, tmp_path / "out", config=CONFIG, workers=1, say=said.append)
+    told = "'again' is 'second' once more: the files are the same, byte for byte"
+    assert made.copies == {"again": "second"}
+    assert {"again", "second"} <= made.groups[0].poses.keys()
+    np.testing.assert_allclose(made.groups[0].poses["again"], made.groups[0].poses["second"], atol=0.02)
+    assert [line for line in said if line.startswith(f"note: {told}")]
+    assert told in summary(made)
+    assert told in html.unescape((tmp_path / "out" / "page.html").read_text())
+    assert json.loads((tmp_path / "out" / "poses.json").read_text())["copies"] == {"again": "second"}
+    rows = {row["scan"]: row for row in csv.DictReader((tmp_path / "out" / "scans.csv").open())}
+    assert "the same file as 'second'" in rows["again"]["reason"]
+    assert "same" not in rows["second"]["reason"]
+
+
+def test_no_scan_is_the_copy_of_one_that_cannot_be_read_and_three_are_copies_of_the_first():
+    scans = [Scan(name, f"/{name}") for name in "abcd"]
+    assert find_copies(scans, {"/a": "x", "/b": "x", "/d": "x"}.get) == {"b": "a", "d": "a"}
+    assert find_copies(scans, {}.get) == {}
 
 
 def test_a_loop_that_does_not_close_is_told_with_what_it_is_off():

@@ -120,6 +120,8 @@ def command(
 
 def summary(model: SceneModel) -> str:
     """Who stands where, and who does not."""
+    from geomoe3d.multiway.scans import copies_in_words
+
     placed = sum(len(group.poses) for group in model.groups)
     color = "green" if model.ok else "yellow"
     kept = sum(edge.kept for edge in model.edges)
@@ -136,6 +138,7 @@ def summary(model: SceneModel) -> str:
         said = [text for text in (group.repeated, group.bent) if text]
         lines += [click.style(f"    {text}", fg="yellow") for text in said]
     lines += [f"  {name} may be wrong: {reason}" for name, reason in model.doubted.items()]
+    lines += [f"  {told}" for told in copies_in_words(model.copies)]
     if model.unplaced:
         lines.append("not placed:")
     shown = list(model.unplaced.items())[:20]

@@ -154,6 +154,7 @@ class SceneModel:
         num_pairs: pairs registered so far.
         seconds: wall time of this call by stage.
         faults: name of a scan that is placed -> what is wrong with it as a whole: mirrored, or of another unit.
+        copies: name of a scan -> name of an earlier one whose file is the same, byte for byte.
     """
 
     folder: Path
@@ -165,6 +166,7 @@ class SceneModel:
     num_pairs: int
     seconds: dict[str, float]
     faults: dict[str, str] = field(default_factory=dict)
+    copies: dict[str, str] = field(default_factory=dict)
 
     @property
     def ok(self) -> bool:
@@ -234,6 +236,7 @@ class SceneModel:
                 for edge in self.edges
             ],
             "doubted": self.doubted,
+            "copies": self.copies,
             "num_pairs": self.num_pairs,
         }
         return json.dumps(data, indent=1, allow_nan=False) + "\n"

@@ -16,6 +16,7 @@ from markupsafe import Markup
 from geomoe3d.clouds.io import load_points
 from geomoe3d.geometry.se3 import shift_frames, transform_points
 from geomoe3d.multiway.model import PAGE_MARK, SceneGroup, SceneModel
+from geomoe3d.multiway.scans import copies_in_words
 from geomoe3d.runtime.files import write_text
 from geomoe3d.runtime.words import counted
 from geomoe3d.types import FloatArray
@@ -67,6 +68,7 @@ def render_model_page(model: SceneModel) -> str:
         "colors": colors,
         "unplaced": model.unplaced,
         "doubted": model.doubted,
+        "copies": copies_in_words(model.copies),
         "kept": sorted((edge for edge in model.edges if edge.kept), key=lambda edge: -(edge.shift or 0.0)),
         "doubtful": sorted(doubtful, key=lambda edge: -edge.confidence),
     }

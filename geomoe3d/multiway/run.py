@@ -30,7 +30,14 @@ from geomoe3d.multiway.initial import InitialPoses, read_poses
 from geomoe3d.multiway.model import PAGE_FILE, SceneModel, check_folder, remove_model, write_model
 from geomoe3d.multiway.pose_graph import Library, require_gtsam
 from geomoe3d.multiway.report import contradicted_steps, describe_model
-from geomoe3d.multiway.scans import Scan, as_paths, choose_common_voxel_size, find_scans
+from geomoe3d.multiway.scans import (
+    Scan,
+    as_paths,
+    choose_common_voxel_size,
+    copies_in_words,
+    find_copies,
+    find_scans,
+)
 from geomoe3d.multiway.survey import Survey
 from geomoe3d.pipeline import resolved
 from geomoe3d.runtime.progress import Watch, shows_progress
@@ -156,6 +163,9 @@ def register_scans(
             "or their unit are others now, --fresh (fresh=True) begins anew"
         ) from None
     store.begin()
+    copies = find_copies(found, store.contents.of)
+    for told in copies_in_words(copies):
+        say(f"note: {told}")
     if fresh:
         remove_model(folder)
         forget_checks(survey)
@@ -195,7 +205,7 @@ def register_scans(
     clock("check scans that no sure pair holds")
     faults = find_faults(survey, groups, assembly.edges)
     clock("write the model")
-    model = describe_model(survey, assembly.edges, folder, groups, faults)
+    model = replace(describe_model(survey, assembly.edges, folder, groups, faults), copies=copies)
     if contradicted := contradicted_steps(model.edges):
         say(contradicted)
     write_model(model, merged_voxel_size, e57=e57)

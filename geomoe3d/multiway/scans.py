@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,6 +99,27 @@ def find_clouds(inputs: Iterable[str | os.PathLike[str]]) -> list[Scan]:
     if twice:
         raise InputError(f"'{sorted(twice)[0]}' is given more than once; name every scan once")
     return [Scan(name, str(path)) for name, path in zip(_unique_names(resolved), resolved, strict=True)]
+
+
+def find_copies(scans: Iterable[Scan], content: Callable[[str], str | None]) -> dict[str, str]:
+    """Name of a scan -> name of the first one whose file has the same content, by its hash (None: not known)."""
+    first: dict[str, str] = {}
+    copies = {}
+    for scan in scans:
+        if (found := content(scan.path)) is not None and (
+            earlier := first.setdefault(found, scan.name)
+        ) != scan.name:
+            copies[scan.name] = earlier
+    return copies
+
+
+def copies_in_words(copies: Mapping[str, str]) -> list[str]:
+    """A sentence for each copy."""
+    return [
+        f"'{name}' is '{first}' once more: the files are the same, byte for byte, and each is taken for a scan of its "
+        "own; leave one out if that was not meant"
+        for name, first in copies.items()
+    ]
 
 
 def _is_transform(path: Path) -> bool:

@@ -29,7 +29,8 @@ def scans_text(model: SceneModel) -> str:
         place = ["", "", ""] if T is None else [f"{value:.17g}" for value in T[:3, 3]]
         worst = f"{max(shifts):.4g}" if shifts else ""
         loose = "" if mine else "held loosely: no single pair is kept"
-        reason = model.unplaced.get(scan.name, model.doubted.get(scan.name, loose))
+        same = f"the same file as '{model.copies[scan.name]}'" if scan.name in model.copies else loose
+        reason = model.unplaced.get(scan.name, model.doubted.get(scan.name, same))
         rows.append([scan.name, number, *place, len(mine), worst, reason, scan.path])
     return csv_text(_SCANS, rows)
 

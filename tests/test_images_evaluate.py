@@ -217,3 +217,11 @@ def test_what_was_finished_before_a_stop_is_kept_and_other_settings_are_refused(
     assert [{**one, "seconds": 0} for one in again] == [{**one, "seconds": 0} for one in whole]
     done = run(*words, "--pairs", "4")
     assert isinstance(done.exception, InputError) and "pairs (200 there, 4 now)" in str(done.exception)
+    assert "give another folder, or remove this one" in str(done.exception)
+    assert "--fresh" not in str(done.exception)  # which this verb does not have
+    for words in (("score", kept), ("score", kept / "1-plain"), ("compare", kept, kept)):
+        done = run("evaluate", *words)
+        assert isinstance(done.exception, InputError) and not isinstance(done.exception, FormatError)
+        assert "keeps pairs of photographs" in str(done.exception)
+        assert "evaluate images` with --keep" in str(done.exception)
+    assert len(journal.read_text().splitlines()) == 2

@@ -27,6 +27,8 @@ from geomoe3d.types import BoolArray, FloatArray
 
 RUN_FILE = "run.json"
 PREDICTIONS_FILE = "predictions.jsonl"
+PHOTOGRAPHS = "photographs"
+"""The track of what `evaluate images --keep` keeps, which is scored there alone."""
 
 
 def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
@@ -41,10 +43,12 @@ def open_run(folder: Path, info: RunInfo) -> tuple[Journal, set[str]]:
     if (folder / RUN_FILE).is_file():
         differing = differences(_compared(read_info(folder)), _compared(info))
         if differing:
-            raise InputError(
-                f"'{folder}' holds predictions of another run; give another folder or label, or --fresh to predict "
-                f"again. They differ in {in_words(differing)}"
+            other = (
+                "holds predictions of another run; give another folder or label, or --fresh to predict again"
             )
+            if info.track == PHOTOGRAPHS:
+                other = "keeps pairs of other arguments or of another version; give another folder, or remove this one"
+            raise InputError(f"'{folder}' {other}. They differ in {in_words(differing)}")
     else:
         if (folder / PREDICTIONS_FILE).is_file() and (folder / PREDICTIONS_FILE).stat().st_size:
             raise InputError(

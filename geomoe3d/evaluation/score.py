@@ -13,7 +13,7 @@ from geomoe3d.errors import InputError
 from geomoe3d.evaluation.benchmarks import UNRELATED
 from geomoe3d.evaluation.compare import Comparison, compare
 from geomoe3d.evaluation.evaluation_set import load_run_pairs
-from geomoe3d.evaluation.predictions import find_runs, read_info, read_predictions
+from geomoe3d.evaluation.predictions import PHOTOGRAPHS, find_runs, read_info, read_predictions
 from geomoe3d.evaluation.records import EvaluationPair, Prediction, RunScore
 from geomoe3d.evaluation.report_text import to_json, to_markdown
 from geomoe3d.evaluation.report_words import run_key
@@ -51,7 +51,7 @@ def score_runs(study: str | Path, *, raw_truth: bool = False, progress: Watch = 
         progress: called with (runs scored, runs in all); None shows a bar when it takes long, False nothing.
 
     Raises:
-        InputError: no predictions there, or their ground truth is gone or changed.
+        InputError: no predictions there, pairs of photographs, or their ground truth is gone or changed.
         FormatError: a file of the cache is damaged.
     """
     folders = find_runs(Path(study))
@@ -59,7 +59,13 @@ def score_runs(study: str | Path, *, raw_truth: bool = False, progress: Watch = 
     for number, folder in enumerate(folders):
         if progress:
             progress(number, len(folders))
-        info, predictions = read_info(folder), read_predictions(folder)
+        info = read_info(folder)
+        if info.track == PHOTOGRAPHS:
+            raise InputError(
+                f"'{folder}' keeps pairs of photographs, which are no predictions to be scored: the call of `geomoe3d "
+                "evaluate images` with --keep that made it, given again, shows their figures without measuring anew"
+            )
+        predictions = read_predictions(folder)
         pairs = load_run_pairs(info)
         score = summarise(info, pairs, predictions, raw_truth=raw_truth)
         runs.append(ScoredRun(folder, pairs, predictions, score))

@@ -20,7 +20,7 @@ import numpy as np
 from geomoe3d.errors import InputError
 from geomoe3d.evaluation.intervals import Quantity, measure_all
 from geomoe3d.evaluation.metrics import precision_recall_f1
-from geomoe3d.evaluation.predictions import open_run
+from geomoe3d.evaluation.predictions import PHOTOGRAPHS, open_run
 from geomoe3d.evaluation.records import Measure, RunInfo
 from geomoe3d.evaluation.report_text import markdown_table
 from geomoe3d.evaluation.report_words import with_intervals
@@ -118,7 +118,7 @@ def evaluate_kept(
     """
     code = {"code": source_hash(__name__), "libraries": library_versions(source_closure(__name__))}
     info = RunInfo(
-        "images", "images", "photographs", scene, {**identity, **code}, source_commit(), hardware(), 0, "",
+        "images", "images", PHOTOGRAPHS, scene, {**identity, **code}, source_commit(), hardware(), 0, "",
         datetime.now(timezone.utc).isoformat(timespec="seconds"),
     )  # fmt: skip
     journal, done = open_run(folder, info)

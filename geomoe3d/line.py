@@ -119,7 +119,8 @@ class Line:
             look = self._sought_again(look, clouds, places, sides)
         clock("decide")
         decision, agreeing = look.decision, self._mirrored_agreement(prepared, places)
-        asks_mirrored = config.second_look.mirror and self.again is not None
+        # What features say of the mirrored source says nothing of a user's own matches of the source as it is.
+        asks_mirrored = config.second_look.mirror and self.again is not None and self.given is None
         # None of these needs the others, so they are had side by side.
         tasks: list[Callable[[], Any]] = []
         if decision.answer is not None:

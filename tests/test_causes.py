@@ -79,6 +79,15 @@ def test_a_mirrored_cloud_is_named_and_never_ok() -> None:
     assert result.reasons[0].startswith("mirrored: with x of 'source' the other way round the clouds fit")
 
 
+def test_matches_of_ones_own_that_fix_nothing_do_not_make_a_cloud_mirrored() -> None:
+    """The same pair that is ok without them was called mirrored: what was compared was nothing with features."""
+    source, target, _ = make_sample_pair(seed=0)
+    rows = np.array([[1.0, 2, 3, 4, 5, 6]])
+    result = geomoe3d.register(source.file_points[::3], target.file_points[::3], correspondences=rows)
+    assert result.status == "failed"
+    assert not [reason for reason in result.reasons if "mirrored" in reason]
+
+
 @dataclass(frozen=True)
 class Liked:
     factor: float

@@ -91,6 +91,7 @@ def test_one_bad_normal_drops_all_normals(tmp_path: Path, bad: float) -> None:
 def test_missing_file_and_directory(tmp_path: Path) -> None:
     fails(tmp_path / "none.ply", "there is no file", "none.ply", error=MissingFileError)
     fails(str(tmp_path), "is a folder; give one file", error=InputError)
+    fails("", "an empty name is given for a cloud", error=InputError)
     (tmp_path / "folder.ply").mkdir()
     fails(tmp_path / "folder.ply", "is a folder; give one file", error=InputError)
 

@@ -12,6 +12,7 @@ import yaml
 from cloud_files import UTM, rigid
 from scipy.spatial.transform import Rotation
 
+from geomoe3d.clouds.correspondence_files import load_correspondences
 from geomoe3d.clouds.transform_files import (
     TRANSFORM_FORMATS,
     load_transform,
@@ -27,6 +28,16 @@ COMMENTS = ["maps SOURCE (a.ply) into TARGET (b.ply)", "status ok"]
 def close(found: np.ndarray) -> None:
     np.testing.assert_allclose(found[:3, :3], T[:3, :3], rtol=0, atol=1e-15)
     np.testing.assert_array_equal(found[:, 3], T[:, 3])
+
+
+def test_complex_numbers_are_no_transform_and_no_correspondences(tmp_path: Path) -> None:
+    """Their imaginary parts were dropped, and what was left was taken."""
+    np.save(tmp_path / "T.npy", T + 0j)
+    with pytest.raises(FormatError, match="holds no transform: complex numbers"):
+        load_transform(tmp_path / "T.npy")
+    np.save(tmp_path / "rows.npy", np.ones((5, 6)) * 1j)
+    with pytest.raises(FormatError, match="complex numbers"):
+        load_correspondences(tmp_path / "rows.npy")
 
 
 @pytest.mark.parametrize("kind", [k for k in TRANSFORM_FORMATS if k != "json"])

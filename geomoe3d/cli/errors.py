@@ -55,7 +55,7 @@ class Verb(click.Command):
         words = " ".join(self.collect_usage_pieces(ctx)[1:]).split()
         names = {name for option in self.params for name in option.opts}
         try:
-            return super().parse_args(ctx, args)
+            left = super().parse_args(ctx, args)
         except click.NoSuchOption as error:
             if error.option_name in ("--output", "--out", "-o") and words and "OUT" in words[-1]:
                 said = f"{error.option_name} is not an option here: {words[-1]} is the last argument"
@@ -66,6 +66,15 @@ class Verb(click.Command):
                 said = f"{error.message}; the file to write is given by --output"
                 raise click.UsageError(said, ctx) from None
             raise
+        for argument in self.params:
+            given = ctx.params.get(str(argument.name)) if isinstance(argument, click.Argument) else None
+            if given == "" or (isinstance(given, tuple) and "" in given):
+                name = argument.make_metavar(ctx)
+                said = (
+                    f"an empty name is given for {name}; it would mean the folder where you are, which is '.'"
+                )
+                raise click.UsageError(said, ctx)
+        return left
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Both kinds, each in the order in which they were declared."""

@@ -21,6 +21,8 @@ def load_correspondences(path: str | Path) -> FloatArray:
         else:
             text = place.read_text(encoding="utf-8").replace(",", " ").replace(";", " ")
             rows = np.loadtxt(text.splitlines(), ndmin=2)
+        if rows.dtype.kind == "c":
+            raise ValueError("complex numbers, expected real ones")
         found: FloatArray = np.asarray(rows, dtype=np.float64)
     except OSError as error:
         raise cannot_read(error, f"cannot read '{path}': {error.strerror or error}") from None

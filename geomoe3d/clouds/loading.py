@@ -168,6 +168,8 @@ def read_raw(data: Any) -> RawCloud:
         return RawCloud(data.file_points, data.normals, data.colors, sensor=data.sensor)
     if not _is_path(data):
         return objects.raw_from_object(data)
+    if not os.fspath(data):
+        raise InputError("an empty name is given for a cloud; give the path of a file")
     path = Path(data)
     take_inherited()
     try:

@@ -214,6 +214,8 @@ def _of_npy(data: bytes) -> FloatArray:
     """The transform of an NPY file; one whose header describes more than memory holds is refused too."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
+        if array.dtype.kind == "c":
+            raise FormatError("complex numbers, expected real ones")
         return of_matrix(np.asarray(array, dtype=np.float64))
     except FormatError:
         raise

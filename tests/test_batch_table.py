@@ -152,3 +152,8 @@ def test_memory_is_estimated_and_workers_are_bounded(scans, monkeypatch):
     assert choose_workers(None, 100 * each)[0] == 1
     with pytest.raises(InputError, match="at least 1"):
         choose_workers(0, each)
+
+
+def test_a_folder_in_place_of_a_table_is_told_what_takes_folders(tmp_path):
+    with pytest.raises(InputError, match=r"is a folder, not a table of pairs; .* by `multiway`"):
+        read_pairs(tmp_path)

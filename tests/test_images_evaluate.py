@@ -182,6 +182,22 @@ def test_homographies_of_all_three_kinds(tmp_path):
         assert found["summary"]["ratio test, RANSAC"][f"auc {MEASURE.corner[1]:g}"]["value"] > 60
 
 
+@pytest.mark.parametrize("rows", [np.zeros((3, 3)), np.eye(2, 3), np.ones((4, 3)), np.diag([1, 1, np.nan])])
+def test_a_model_that_is_no_homography_is_refused(rows, tmp_path):
+    cv2.imwrite(str(tmp_path / "wallA.png"), texture())
+    np.savetxt(tmp_path / "wall_model.txt", rows)
+    np.savetxt(tmp_path / "wall_pts.txt", np.ones((20, 6)))
+    done = run("evaluate", "images", tmp_path, "--homographies")
+    assert isinstance(done.exception, FormatError)
+    assert "wall_model.txt' holds no homography: three rows of three numbers" in str(done.exception)
+
+
+def test_a_scene_that_is_given_twice_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "any.png"), texture())
+    done = run("evaluate", "images", tmp_path, f"{tmp_path}/../{tmp_path.name}", "--homographies")
+    assert "is given more than once; its pairs would count twice" in str(done.exception.message)
+
+
 def test_what_was_finished_before_a_stop_is_kept_and_other_settings_are_refused(tmp_path, monkeypatch):
     folder, kept = tmp_path / "plain", tmp_path / "kept"
     folder.mkdir()

@@ -86,6 +86,10 @@ def read_pairs(path: str | os.PathLike[str]) -> list[PairRow]:
     except UnicodeDecodeError:
         raise FormatError(f"'{path}' is no text in UTF-8; save the table as 'CSV UTF-8'") from None
     except OSError as error:
+        if Path(path).is_dir():
+            raise InputError(
+                f"'{path}' is a folder, not a table of pairs; all scans of a folder are registered by `multiway`"
+            ) from None
         raise cannot_read(error, f"cannot read '{path}': {error.strerror}") from None
     head = text.partition("\n")[0]
     separator = max(",;\t", key=head.count)

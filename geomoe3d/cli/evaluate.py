@@ -230,7 +230,10 @@ def images(
         check_output(output, force=force)
     network = None if weights is None else ImageNetwork(weights)
     root = None if images is None else Path(images)
-    stems = [Path(folder).resolve().stem for folder in folders]
+    places = [Path(folder).resolve() for folder in folders]
+    if twice := [folder for folder, place in zip(folders, places, strict=True) if places.count(place) > 1]:
+        raise click.UsageError(f"'{twice[0]}' is given more than once; its pairs would count twice")
+    stems = [place.stem for place in places]
     names = stems if len(set(stems)) == len(stems) else folders  # a name stands for one scene
     outcomes: list[Outcome] = []
     with progress_bar("scenes") as advance:

@@ -109,7 +109,7 @@ def hpatches_cases(folder: Path) -> Iterator[HomographyPair]:
     first = detect(folder / "1.ppm", most=4000)
     for k in range(2, 7):
         found = match(first, detect(folder / f"{k}.ppm", most=4000))
-        yield HomographyPair(f"1-{k}", found, _numbers(folder / f"H_1_{k}", 3), first.size)
+        yield HomographyPair(f"1-{k}", found, _homography(folder / f"H_1_{k}"), first.size)
 
 
 def model_cases(folder: Path) -> Iterator[HomographyPair]:
@@ -123,7 +123,18 @@ def model_cases(folder: Path) -> Iterator[HomographyPair]:
         rows = _numbers(folder / f"{name}_pts.txt", 6)[:, [0, 1, 3, 4]]
         height, width = read_grey(images.get(f"{name}A", folder / f"{name}A.png")).shape
         matches = Matches(rows, np.zeros(len(rows)), np.ones(len(rows), dtype=bool))
-        yield HomographyPair(name, matches, np.linalg.inv(_numbers(file, 3)).astype(float), (width, height))
+        yield HomographyPair(name, matches, np.linalg.inv(_homography(file)).astype(float), (width, height))
+
+
+def _homography(file: Path) -> FloatArray:
+    """The three rows of three numbers of a file. Raises FormatError: it holds others, or no homography."""
+    H = _numbers(file, 3)
+    norm = float(np.linalg.norm(H))
+    if H.shape != (3, 3) or not (np.isfinite(norm) and abs(np.linalg.det(H / max(norm, 1e-300))) > 1e-15):
+        raise FormatError(
+            f"'{file}' holds no homography: three rows of three numbers whose determinant is not 0"
+        )
+    return H
 
 
 def _numbers(file: Path, columns: int) -> FloatArray:

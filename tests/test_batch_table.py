@@ -132,8 +132,8 @@ def test_no_text_of_a_table_is_a_formula():
     assert results_table([record]).splitlines()[1] == f"'=1+1,error{',' * 19}'@no"
 
 
-def test_the_summary_names_pairs_whole(tmp_path):
-    name = "building A/scan 17 of the north wing" + "+" + "building A/scan 18 of the north wing"
+def test_the_summary_names_pairs_whole_where_that_is_short(tmp_path):
+    name = "north wing of A/scan 17.e57" + "+" + "north wing of A/scan 18.e57"  # wider than the column
     report = BatchReport(
         tmp_path, (Outcome(name, None, "cannot be read"), Outcome("b", None, "nor this")), 2, 0
     )

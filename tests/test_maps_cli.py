@@ -92,6 +92,19 @@ def test_lengths_are_printed_with_the_unit_that_is_named(house, scan, tmp_path, 
     assert f"{GRID:g} m" in capfd.readouterr().out
 
 
+def test_a_grid_finer_than_what_a_map_keeps_is_told(rooms, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    np.save("room.npy", scanned(rooms[0], UTM, 1))
+    assert ask("index", "room.npy", "fine.map", "--voxel-size", "1e-6") == ExitCode.OK
+    told = capfd.readouterr()
+    (kept,) = Map.open("fine.map").voxel_sizes
+    assert kept > 1e-3
+    said = f"note: the map keeps no points closer than {kept:.4g}, so it is described on that grid, not on one of 1e-06"
+    assert said in told.err
+    assert ask("index", "room.npy", "usual.map", "--voxel-size", GRID) == ExitCode.OK
+    assert "note" not in capfd.readouterr().err
+
+
 def test_what_is_no_map_is_never_overwritten(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     cloud = np.random.default_rng(0).uniform(0, 1, (500, 3))

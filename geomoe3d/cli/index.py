@@ -115,6 +115,12 @@ def command(
             "begin anew with --fresh if that was the same scan",
             err=True,
         )
+    if config.voxel_size is not None and config.voxel_size < made.voxel_sizes[0]:
+        click.echo(
+            f"note: the map keeps no points closer than {made.voxel_sizes[0]:.4g}, so it is described on that grid, "
+            f"not on one of {config.voxel_size:g}",
+            err=True,
+        )
     if not quiet:
         added = len(made.sources) - len(before)
         sizes = ", ".join(f"{size:.4g}" for size in made.voxel_sizes)

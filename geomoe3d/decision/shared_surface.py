@@ -76,11 +76,12 @@ class SharedSurface:
         back = Met.of((target.points[back_rows] - t) @ R / scale, source.tree, reach / scale)
         first = np.concatenate([rows[ours.rows], back.nearest])
         second = np.concatenate([ours.nearest, back_rows[back.rows]])
-        normals = np.vstack([target.normals[ours.nearest], turned[back.nearest]])
-        cosines = np.abs(np.einsum("ij,ij->i", turned[first], target.normals[second]))
-        agree = cosines > expert().shared_surface.least_cosine
-        points, normals = moved[first][agree], normals[agree]
-        gaps = np.einsum("ij,ij->i", target.points[second][agree] - points, normals)
+        here, there = turned.take(first, axis=0), target.normals.take(second, axis=0)
+        cosines = np.abs(np.einsum("ij,ij->i", here, there))
+        there[len(ours.rows) :] = here[len(ours.rows) :]  # gaps are along normals of the cloud that is asked
+        agree = np.flatnonzero(cosines > expert().shared_surface.least_cosine)
+        points, normals = moved.take(first[agree], axis=0), there.take(agree, axis=0)
+        gaps = np.einsum("ij,ij->i", target.points.take(second[agree], axis=0) - points, normals)
         return Contact(points, normals, gaps, (len(ours.rows) / len(rows), len(back.rows) / len(back_rows)))
 
 

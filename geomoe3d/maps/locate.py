@@ -22,7 +22,7 @@ from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement, judge, lead_over
 from geomoe3d.decision.scale import measure_scale
-from geomoe3d.decision.selection import Selection
+from geomoe3d.decision.selection import Selection, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Compared, Level
@@ -30,7 +30,7 @@ from geomoe3d.maps.places import Query, Window, likest
 from geomoe3d.maps.sight import Sight, seen_factor
 from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
-from geomoe3d.runtime.threads import ahead, each, single_blas_thread
+from geomoe3d.runtime.threads import ahead, beside, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
@@ -239,7 +239,7 @@ class Search:
             least = known.worth_polishing * max((q for q, _ in scored), default=0.0)
             fresh = [(self.quick(h.T_target_source, least), h) for h in proposed]
             scored += fresh
-            best = max(fresh, key=_score, default=None)
+            best = max(fresh, key=lambda item: item[0], default=None)
             if found is None and times == 1.0 and best is not None and best[0] > max(plain, known.plainest):
                 found = window.votes, transform_points(best[1].T_target_source, self.center[None])[0]
         return scored
@@ -259,11 +259,15 @@ class Search:
             target = self._around(T, fully)
             self._clock("match")
             pair = self._line.match((self.scan, target), None, self._clock)
-            _, proposed = self._line.propose(pair, self._clock)
+            # Proposing keeps one thread busy most of the time.
+            (_, proposed), surfaces = beside(
+                lambda: self._line.propose(pair, self._clock), lambda: surfaces_of(pair, self._line.scorers)
+            )
             scorers = dict(self._line.scorers)
             if scorers and len(self._sight.sensors):
                 scorers["sight"] = Sight(self._sight, self.scan.points[self._rows[::4]])
-            selection = Selection(pair, scorers, self._line.refiner.about(pair), self.config, self._clock)
+            polish = self._line.refiner.about(pair)
+            selection = Selection(pair, scorers, polish, self.config, self._clock, surfaces=surfaces)
             selection.add([Hypothesis(T), *proposed])
             decision = selection.decide()
             return Found(pair, decision, stood=decision.judgement.status == "ok")
@@ -308,11 +312,13 @@ class Search:
             decision = decision.with_note(answer.note)
         self._clock("decide")
         shared = SharedSurface(*pair.clouds)
-        scale = measure_scale(T, shared)
+        scale, told = beside(
+            lambda: measure_scale(T, shared),
+            lambda: measure_accuracy(T, shared, pair.matched, pair.inlier_threshold),
+        )
         if scale is not None:  # maps are bent where their scans were joined
             scale = replace(scale, sigma=expert().locating.scale_deviation * scale.sigma)
         decision = decision.with_scale(scale, (pair.clouds[0].name, pair.clouds[1].name))
-        told = measure_accuracy(T, shared, pair.matched, pair.inlier_threshold)
         stood = best.decision.judgement.status == "ok"
         return Found(pair, replace(decision, accuracy=told), sure, stood), distinct
 
@@ -385,10 +391,6 @@ class Search:
         part = replace(self._part, viewpoint=None if self.scan.viewpoint is None else eye)
         self._clock("features")
         return level.seen_from(eye, rows, part, self._line.descriptor, fully)
-
-
-def _score(candidate: tuple[float, Hypothesis]) -> float:
-    return candidate[0]
 
 
 def likely(candidates: Sequence[tuple[float, Hypothesis]], most: int) -> Iterator[Hypothesis]:

@@ -165,6 +165,8 @@ def load_object(spec: str, what: str) -> Any:
         ConfigError: the file or module is missing or fails as it is imported, or holds no such name.
     """
     place, _, name = spec.rpartition(":")
+    if not (place and name):
+        raise ConfigError(f"'{spec}' names no code of yours to be {what}; write file.py:NAME or module:NAME")
     module = _load_file(place, what) if place.endswith(".py") else _import(place, name)
     try:
         return getattr(module, name)

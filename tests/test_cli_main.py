@@ -87,6 +87,8 @@ def test_register_is_a_command_of_its_own(monkeypatch, capsys):
         ),
         (["pose", "a", "b", "--keypoints", "7"], "a whole number, at least 8 and at most 100000"),
         (["data", "features", "a", "b", "--min-overlap", "1.01"], "a number, at least 0 and at most 1"),
+        (["register", "a", "b", "--reader", "mine"], "'mine' names no code of yours"),
+        (["register", "a", "b", "--reader", "mine.py:"], "write file.py:NAME or module:NAME"),
         (["register", "a"], "TARGET"),
         (["register", "", "b"], "an empty name is given for SOURCE"),
         (["multiway", "a", "b", ""], "an empty name is given for SCANS... OUT"),

@@ -190,13 +190,9 @@ class Detail:
 
 def _agreeing(search: Search, T: FloatArray, rows: IntArray) -> FloatArray:
     """(M,) share of some of the scan's points, by their rows, that lie on the map's planes under motions (M, 4, 4)."""
-    level, scan, turned = search.level, search.scan, T[:, :3, :3].transpose(0, 2, 1)
+    scan, turned = search.scan, T[:, :3, :3].transpose(0, 2, 1)
     moved = scan.points[rows] @ turned + T[:, None, :3, 3]
-    distance, nearest = level.tree.query(moved, distance_upper_bound=2 * level.voxel_size)
-    hit = np.isfinite(distance)
-    normals = level.normals[np.where(hit, nearest, 0)]
-    cosine = np.abs(np.einsum("mni,mni->mn", scan.normals[rows] @ turned, normals))
-    share: FloatArray = (hit & (cosine > expert().surfaces.least_cosine)).mean(1)
+    share: FloatArray = search.level.met(moved, scan.normals[rows] @ turned)[1].mean(1)
     return share
 
 

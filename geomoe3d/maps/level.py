@@ -116,6 +116,14 @@ class Level:
 
         return cKDTree(self.points)
 
+    def met(self, points: FloatArray, normals: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """Which of points (..., 3) with normals have a point of the map within two voxels, and which of these its plane
+        too, whichever way it faces."""
+        distance, nearest = self.tree.query(points, distance_upper_bound=2 * self.voxel_size)
+        hit = np.isfinite(distance)
+        cosines = np.einsum("...i,...i->...", normals, self.normals[np.where(hit, nearest, 0)])
+        return hit, hit & (np.abs(cosines) > expert().surfaces.least_cosine)
+
     def range_image(self, number: int) -> RangeImage:
         """What one of the sensors saw; made once."""
         if number not in self._range_images:

@@ -193,12 +193,9 @@ class Search:
             if self.quick(twin, least) <= least:
                 return None
             moved_there = twin @ inverse(T)
-            there, normals = transform_points(moved_there, level.points[wider]), level.normals[wider]
-            distance, nearest = level.tree.query(there, distance_upper_bound=2 * level.voxel_size)
-            hit = np.isfinite(distance)
-            found = level.normals[np.asarray(nearest)[hit]]
-            cosine = np.abs(np.einsum("ij,ij->i", normals[hit] @ moved_there[:3, :3].T, found))
-            return float((cosine > expert().surfaces.least_cosine).sum() / len(wider)), Hypothesis(twin)
+            normals = level.normals[wider] @ moved_there[:3, :3].T
+            _, same = level.met(transform_points(moved_there, level.points[wider]), normals)
+            return float(same.mean()), Hypothesis(twin)
 
         alike = each(sought, likest(windows, center, self.reach, max(known.twin_windows, count)))
         found = [twin for twin in alike if twin is not None]
@@ -357,11 +354,8 @@ class Search:
         """
         level, voxel = self.level, self.level.voxel_size
         moved = transform_points(T, self.scan.points[self._rows])
-        distance, nearest = level.tree.query(moved, distance_upper_bound=2 * voxel)
-        hit = np.isfinite(distance)
-        normals = self.scan.normals[self._rows][hit] @ T[:3, :3].T
-        cosine = np.abs(np.einsum("ij,ij->i", normals, level.normals[np.asarray(nearest)[hit]]))
-        agreement = float((cosine > expert().surfaces.least_cosine).sum() / len(moved))
+        hit, same = level.met(moved, self.scan.normals[self._rows] @ T[:3, :3].T)
+        agreement = float(same.mean())
         if agreement > least:
             agreement *= seen_factor(self._sight, moved[~hit], len(moved))
         if self._view is None or agreement <= least:

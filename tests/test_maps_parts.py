@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomoe3d.config import PreparationConfig, RegistrationConfig, expert
@@ -53,9 +52,9 @@ def test_a_place_with_no_point_of_the_map_around_it_is_worth_nothing():
         [[0, 0, 0], [50, 0, 0]], 100, axis=0
     )
     up = np.tile([0.0, 0.0, 1.0], (200, 1))
-    level = SimpleNamespace(
-        voxel_size=0.1, points=ends, normals=up, tree=cKDTree(ends), sensors=np.zeros((0, 3))
-    )
+    rows, none = np.arange(200), np.zeros(0, dtype=np.int64)
+    fpfh, features = np.zeros((200, 33), np.float16), np.zeros((200, 65), np.float32)
+    level = Level(0.1, ends, up, fpfh, rows, features, none, features[:0], np.zeros((0, 3)))
     scan = SimpleNamespace(points=ends, normals=up)
     search = SimpleNamespace(
         level=level,

@@ -353,19 +353,16 @@ class RegistrationResult:
             data["T_target_source"] = _array(data["T_target_source"], (4, 4))
             data["information_matrix"] = _array(data["information_matrix"], (6, 6))
             data["information_center"] = _array(data["information_center"], (3,))
-            for name in ("inlier_threshold", "voxel_size"):
-                data[name] = float("nan") if data[name] is None else float(data[name])
+            data |= _numbers({name: data[name] for name in ("inlier_threshold", "voxel_size", "overlap")})
             if data["alternative"] is not None:
-                data["alternative"]["T_target_source"] = _array(
-                    data["alternative"]["T_target_source"], (4, 4)
-                )
-                data["alternative"] = Alternative(**data["alternative"])
+                T = _array(data["alternative"].pop("T_target_source"), (4, 4))
+                data["alternative"] = Alternative(T, **_numbers(data["alternative"]))
             for side in ("source", "target"):
                 data[side]["origin"] = tuple(data[side]["origin"])
                 data[side] = CloudReport(**data[side])
             data["reasons"] = tuple(data["reasons"])
             if data.get("accuracy") is not None:
-                data["accuracy"] = Accuracy(**data["accuracy"])
+                data["accuracy"] = Accuracy(**_numbers(data["accuracy"]))
             found = cls(**data)
             _check_consistent(found)
             return found
@@ -386,6 +383,10 @@ def _check_consistent(result: RegistrationResult) -> None:
     rigid = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=0.01) and np.linalg.det(R) > 0
     if not rigid or not np.array_equal(T[3], [0, 0, 0, 1]):
         raise ValueError("T_target_source is no rotation and translation (times scale)")
+
+
+def _numbers(values: dict[str, Any]) -> dict[str, float]:
+    return {name: float("nan") if value is None else float(value) for name, value in values.items()}
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:

@@ -120,6 +120,10 @@ def test_nothing_is_said_where_next_to_nothing_lies_on_each_other() -> None:
 def test_json_and_inverse_keep_it_and_old_results_have_none() -> None:
     result = replace(room_view().result, accuracy=FOUND)
     assert RegistrationResult.from_json(result.to_json()).accuracy == FOUND
+    without = replace(result, accuracy=replace(FOUND, inlier_rmse=float("nan")), overlap=float("nan"))
+    again = RegistrationResult.from_json(without.to_json())
+    assert np.isnan(again.overlap) and again.accuracy is not None and np.isnan(again.accuracy.inlier_rmse)
+    assert ("matches", "none is an inlier") in accuracy_facts(again)
     inverse = result.inverse()
     assert inverse.accuracy == FOUND.exchanged() and inverse.inverse().accuracy == FOUND
     assert RegistrationResult.from_json(room_view().result.to_json()).accuracy is None

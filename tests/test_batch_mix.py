@@ -5,17 +5,18 @@ import json
 import numpy as np
 import pytest
 
-from geomoe3d import register_pairs
+from geomoe3d import RegistrationResult, register_pairs
 from geomoe3d.batch.mix import share_that_belongs, shared_out
 from geomoe3d.batch.run import BatchReport
 from geomoe3d.batch.store import BatchStore
 from geomoe3d.cli.batch import table
 from geomoe3d.config import expert, load_config
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.runtime.words import of_all
 
 
 def record(name: str, confidence: float, status: str = "ok") -> dict:
-    result = {"confidence": confidence, "status": status, "reasons": [], "evidence": {"overlap": 0.5}}
+    result = {"confidence": confidence, "status": status, "reasons": ["a note"], "evidence": {"overlap": 0.5}}
     return {"id": name, "fingerprint": "0", "error": None, "result": result, "seconds": {}}
 
 
@@ -56,10 +57,11 @@ def test_an_ok_that_falls_below_the_limit_says_why_and_keeps_what_it_was() -> No
     assert near["status"] == "low_confidence" and near["confidence"] < 0.7
     assert near["evidence"]["confidence_alone"] == 0.97 and near["evidence"]["overlap"] == 0.5
     assert near["reasons"][0].startswith(
-        f"about {100 * share:.0f} % of the pairs of this batch belong together"
+        f"only {of_all(share)} of the pairs of this batch seem to belong together"
     )
+    assert near["reasons"][1:] == ["a note"]  # the cause comes first
     assert "(0.970 by itself), below 0.95" in near["reasons"][0]
-    assert sure["status"] == "ok" and 0.95 < sure["confidence"] < 0.9999 and sure["reasons"] == []
+    assert sure["status"] == "ok" and 0.95 < sure["confidence"] < 0.9999 and sure["reasons"] == ["a note"]
     assert records[1]["result"]["status"] == "ok"  # the journal's own stays as it is
 
 
@@ -67,9 +69,26 @@ def test_nothing_changes_where_pairs_belong_together_or_a_prior_is_given() -> No
     together = [record(str(k), 0.99) for k in range(40)]
     few = [record("a", 0.96), record("b", 0.99)]
     apart = [record(str(k), 0.1, "low_confidence") for k in range(40)]
-    for records, settings in ((together, []), (few, []), (apart, ["decision.prior=0.3"])):
+    cases = ((together, []), (few, []), (apart[:1], []), (apart, ["decision.prior=0.3"]))
+    for records, settings in cases:
         found, share = shared_out(records, load_config(None, settings))
         assert share is None and list(found.values()) == records
+
+
+def test_the_order_in_which_pairs_were_finished_changes_no_digit() -> None:
+    confidences, _ = drawn(0.3, 300)
+    records = [record(str(k), value) for k, value in enumerate(confidences)]
+    expected = shared_out(records, load_config(None, []))
+    for seed in range(10):
+        order = np.random.default_rng(seed).permutation(len(records))
+        assert shared_out([records[k] for k in order], load_config(None, [])) == expected
+
+
+def test_the_share_that_is_said_is_that_of_the_pairs_themselves() -> None:
+    """Those of the usual mix that are counted in are not theirs."""
+    records = [record(str(k), 0.001, "low_confidence") for k in range(5)]
+    _, share = shared_out(records, load_config(None, []))
+    assert share is not None and of_all(share) == "under 1 %" and of_all(0.014) == "about 1 %"
 
 
 def test_pairs_without_a_result_stay_as_they_are() -> None:
@@ -103,7 +122,38 @@ def test_results_of_a_batch_are_for_its_mix_and_its_journal_is_not(tmp_path, mon
     assert (out / "results.csv").read_text().splitlines()[1].split(",")[1] == report.outcomes[0].status
     assert json.loads((out / "journal.jsonl").read_text()) == line
     said = table(report)
-    assert f"About {100 * report.share:.0f} % of these pairs seem to belong together" in said
+    assert (
+        f"Only {of_all(report.share)} of these pairs seem to belong together, where nine in ten are usual"
+        in said
+    )
+    whole = RegistrationResult.from_json(report.outcomes[0].result.to_json())
+    assert whole.evidence == kept["evidence"] and whole.confidence == kept["confidence"]
+
+
+def test_transforms_and_pages_that_are_there_follow_the_mix_of_a_later_call(tmp_path) -> None:
+    """A pair's status and confidence are the same in all that the folder holds, whatever the call asked for."""
+    source, target, _ = make_sample_pair(seed=0)
+    rng = np.random.default_rng(0)
+    clouds = {"source": source.file_points, "target": target.file_points}
+    clouds |= {f"noise{k}": rng.random((40, 3)) for k in range(4)}
+    for name, points in clouds.items():
+        np.save(tmp_path / f"{name}.npy", points)
+    table_of_pairs, out = tmp_path / "pairs.csv", tmp_path / "out"
+    table_of_pairs.write_text("id,source,target\nit,source.npy,target.npy\n")
+    assert register_pairs(table_of_pairs, out, cache="", transforms=True, page=True, pages=True).share is None
+    before = (out / "transforms" / "it.txt").read_text()
+    with table_of_pairs.open("a") as stream:
+        stream.writelines(f"no{k},noise{k}.npy,target.npy\n" for k in range(4))
+    report = register_pairs(table_of_pairs, out, cache="")
+    assert report.share is not None and report.kept == 1
+    now = report.outcomes[0]
+    written = (out / "transforms" / "it.txt").read_text()
+    assert written != before and f"# status {now.status}, confidence {now.confidence:.4f}" in written
+    assert f'data-confidence="{now.confidence!r}"' in (out / "page.html").read_text()
+    assert repr(now.confidence) in (out / "results.csv").read_text()
+    assert f"confidence {now.confidence:.2f}" in (out / "pages" / "it.html").read_text()
+    register_pairs([(tmp_path / "noise0.npy", tmp_path / "target.npy")], out, cache="", fresh=True)
+    assert not (out / "transforms").exists() and not (out / "pages").exists()
 
 
 class Row:

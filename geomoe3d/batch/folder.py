@@ -99,6 +99,15 @@ def check_extras(
         _check_files(folder / PAGES_FOLDER, {name: page_name(name) for name in names}, is_own_page)
 
 
+def extras_of(folder: Path) -> tuple[bool, bool, bool]:
+    """Whether a batch left transforms, a page, and pages of its pairs in a folder."""
+    return (
+        any(_is_own_transform(path) for path in files_in(folder / TRANSFORMS_FOLDER)),
+        has_mark(folder / PAGE_FILE, PAGE_MARK),
+        any(is_own_page(path) for path in files_in(folder / PAGES_FOLDER)),
+    )
+
+
 def _check_files(place: Path, names: dict[str, str], is_own: Callable[[Path], bool]) -> None:
     """Refuse to write files, by id, into a folder where one of them is somebody else's or has too long a name."""
     what = f"or leave the {place.name} out"

@@ -15,6 +15,7 @@ import numpy as np
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.confidence import prior_logit, said_below
 from geomoe3d.decision.repeat import logit
+from geomoe3d.runtime.words import of_all
 from geomoe3d.types import FloatArray
 
 Record = dict[str, Any]
@@ -25,11 +26,13 @@ ALONE = "confidence_alone"
 def shared_out(
     records: Iterable[Record], config: RegistrationConfig
 ) -> tuple[dict[str, Record], float | None]:
-    """Records by id, their confidences and statuses for the mix of the batch, and its share of pairs that belong
-    together; None, and nothing is changed, where a prior is configured or the share is no lower than in the fit.
+    """Records by id, their confidences and statuses for the mix of the batch, and the share of right answers that
+    these confidences amount to; None, and nothing is changed, where a prior is configured, where there is one answer
+    only, or where the share is no lower than in the fit.
 
-    A confidence p becomes the logistic function of logit(p) + logit(share) - logit(fitted prior). An answer that was
-    ok and falls below ``decision.min_confidence`` is low_confidence, and says so.
+    A confidence p becomes the logistic function of logit(p) + logit(prior) - logit(fitted prior), the prior that of
+    `share_that_belongs`. An answer that was ok and falls below ``decision.min_confidence`` is low_confidence, and
+    gives that as its first reason.
 
     Args:
         records: as the journal keeps them; left as they are.
@@ -38,12 +41,13 @@ def shared_out(
     records = list(records)
     unchanged = {record["id"]: record for record in records}
     found = [record["result"] for record in records if record["result"] is not None]
-    if config.decision.prior is not None or not found:
+    if config.decision.prior is not None or len(found) < 2:
         return unchanged, None
-    share = share_that_belongs(np.array([result["confidence"] for result in found]))
-    added = prior_logit(share)
+    alone = np.array([result["confidence"] for result in found])
+    added = prior_logit(share_that_belongs(alone))
     if added >= 0:
         return unchanged, None
+    share = float(np.mean([_beside(value, added) for value in np.sort(alone)]))
     least = config.decision.min_confidence
     return {name: _less_sure(record, added, share, least) for name, record in unchanged.items()}, share
 
@@ -51,12 +55,13 @@ def shared_out(
 def share_that_belongs(confidences: FloatArray) -> float:
     """The share of pairs whose answers are right, of confidences (n,) that each is for the mix of the fit.
 
-    As if `mix_pairs` more had been asked of that mix, so that few pairs say little.
+    As if `mix_pairs` more had been asked of that mix, so that few pairs say little. To the last digit the same in any
+    order, since pairs are finished in any.
 
     Source: Saerens et al., Neural Computation 2002 (expectation maximisation of prior probabilities).
     """
     known, fitted = expert().confidence.mix_pairs, expert().confidence.fitted_prior
-    alone = np.array([logit(value) for value in confidences])
+    alone = np.array([logit(value) for value in np.sort(confidences)])
     share, before = fitted, 0.0
     while abs(share - before) > 1e-6:
         before = share
@@ -65,18 +70,23 @@ def share_that_belongs(confidences: FloatArray) -> float:
     return share
 
 
+def _beside(alone: float, added: float) -> float:
+    """A confidence among the others, never above what it was."""
+    return min(alone, float(1 / (1 + np.exp(-logit(alone) - added))))
+
+
 def _less_sure(record: Record, added: float, share: float, least: float) -> Record:
     result = record["result"]
     if result is None:
         return record
     alone = result["confidence"]
-    confidence = float(1 / (1 + np.exp(-logit(alone) - added)))
+    confidence = _beside(alone, added)
     evidence = {**result["evidence"], ALONE: alone}
-    result = {**result, "confidence": min(confidence, alone), "evidence": evidence}
+    result = {**result, "confidence": confidence, "evidence": evidence}
     if result["status"] == "ok" and confidence < least:
         reason = (
-            f"about {100 * share:.0f} % of the pairs of this batch belong together; among so many others the "
+            f"only {of_all(share)} of the pairs of this batch seem to belong together; among so many others the "
             f"confidence is {said_below(confidence, least)} ({alone:.3f} by itself), below {least:.2f}"
         )
-        result |= {"status": "low_confidence", "reasons": [*result["reasons"], reason]}
+        result |= {"status": "low_confidence", "reasons": [reason, *result["reasons"]]}
     return {**record, "result": result}

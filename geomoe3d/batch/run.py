@@ -12,12 +12,11 @@ from typing import Any
 from geomoe3d.batch.contents import Contents
 from geomoe3d.batch.folder import (
     PAGE_FILE,
-    PAGE_MARK,
     PAGES_FOLDER,
     TRANSFORMS_FOLDER,
     check_can_be_folder,
     check_extras,
-    has_mark,
+    extras_of,
     write_transforms,
 )
 from geomoe3d.batch.memory import LONG_READ, choose_workers, gibibytes, worker_bytes
@@ -44,7 +43,8 @@ class BatchReport:
         outcomes: one per pair, in the order given.
         made: pairs done by this call.
         kept: pairs that were done already.
-        share: of the pairs that seem to belong together, where it lowered the confidences (`geomoe3d.batch.mix`).
+        share: of the registered pairs, those that seem to belong together; None where no confidence is lower for it
+            (`geomoe3d.batch.mix`).
     """
 
     folder: Path
@@ -182,8 +182,9 @@ def register_pairs(
             the caller's script to be importable (``if __name__ == "__main__":``).
         scheduler: address of a Dask scheduler instead; its workers must see the files under the same paths.
         transforms: write ``transforms/<id>.txt`` for every pair that has a transform.
-        page: write ``page.html`` with a picture of every pair; one of an earlier call is always brought up to date.
-        pages: write ``pages/<id>.html`` for every pair that has a transform, to turn its clouds in.
+        page: write ``page.html`` with a picture of every pair.
+        pages: write ``pages/<id>.html`` for every pair that has a transform, to turn its clouds in. These three, where
+            an earlier call wrote them, are always brought up to date.
         fresh: forget what the folder holds of an earlier batch; not before all that can be refused is known.
         retry: do the pairs again that could not be registered.
         cache: folder of described clouds; None: the user's own; "": none.
@@ -203,6 +204,9 @@ def register_pairs(
     config = resolved(config)
     labour = Labour(workers, scheduler, cache).checked()
     store = BatchStore(folder, config, fresh=fresh)
+    if not fresh:  # what an earlier call wrote must not show what is no longer so
+        before = extras_of(folder)
+        transforms, page, pages = transforms or before[0], page or before[1], pages or before[2]
     check_extras(folder, [row.id for row in rows], transforms=transforms, page=page, pages=pages)
     alone, kept = work(rows, store, config, labour, retry, progress=progress, say=say)
     records, share = shared_out(alone.values(), config)
@@ -216,7 +220,7 @@ def register_pairs(
         from geomoe3d.batch.pair_pages import write_pages
 
         write_pages(folder / PAGES_FOLDER, rows, outcomes, progress=told)
-    if page or has_mark(folder / PAGE_FILE, PAGE_MARK):  # an older page must not show what is no longer so
+    if page:
         from geomoe3d.batch.page import save_batch_page
 
         save_batch_page(folder / PAGE_FILE, rows, outcomes, progress=told)

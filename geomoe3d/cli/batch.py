@@ -11,7 +11,7 @@ import click
 from geomoe3d.cli.errors import HELP, ExitCode, Verb, traceback_option, use_instead
 from geomoe3d.cli.files import part_option
 from geomoe3d.cli.parts import cache_options, configuration_options, scale_option, worker_options
-from geomoe3d.runtime.words import counted
+from geomoe3d.runtime.words import counted, of_all
 
 if TYPE_CHECKING:
     from geomoe3d.batch.run import BatchReport
@@ -85,9 +85,10 @@ def table(report: BatchReport) -> str:
     if report.share is not None:
         lines += [
             "",
-            f"  About {100 * report.share:.0f} % of these pairs seem to belong together. Each is believed as in such a "
-            "mix, less than alone;",
-            "  what you know of it is given with --set decision.prior=0.5.",
+            f"  Only {of_all(report.share)} of these pairs seem to belong together, where nine in ten are usual. So "
+            "every answer is believed",
+            "  less than by itself; the reasons are those of the pair by itself. If you know the share, give it:",
+            "  --set decision.prior=0.5 --fresh",
         ]
     doubtful = sorted((o for o in report.outcomes if o.status != "ok"), key=lambda o: (o.confidence, o.id))
     if doubtful:

@@ -11,6 +11,11 @@ def counted(number: int, one: str, many: str | None = None) -> str:
     return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
+def of_all(share: float) -> str:
+    """``about 15 %``; a share that is nearly none as ``under 1 %``."""
+    return f"about {100 * share:.0f} %" if share >= 0.01 else "under 1 %"
+
+
 def shape_in_words(shape: Sequence[int]) -> str:
     """What an array of a shape holds: ``a single number``, ``3 numbers``, ``3 rows of 500 numbers``."""
     if not shape:

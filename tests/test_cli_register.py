@@ -13,6 +13,7 @@ import pytest
 from command_line import TRUTH, call, make_result
 
 from geomoe3d.cli.summary import matrix_text, summary
+from geomoe3d.decision.scale import Scale
 from geomoe3d.errors import OutputError
 from geomoe3d.geometry.se3 import inverse, transform_points
 from geomoe3d.result import RegistrationResult
@@ -32,6 +33,14 @@ def test_every_status_but_ok_ends_with_3_and_still_gives_the_transform(
     assert "The clouds share too little." in printed
     assert matrix_text(TRUTH) in printed
     assert ("\nnext: look at it" in printed) == (status != "failed")
+
+
+def test_where_the_scale_differs_the_next_step_is_to_estimate_it(scan_files, fake_registrar, capsys):
+    reason = Scale(1.1, 0.004).sentence("a", "b")
+    fake_registrar.answer = make_result(status="low_confidence", reasons=("Little is shared.", reason))
+    assert call("register", *scan_files) == 3
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("next: have the ratio of the lengths estimated") and "--estimate-scale" in last
 
 
 def test_summary_tells_everything_and_is_plain_where_nobody_sees_colours(scan_files, fake_registrar, capsys):

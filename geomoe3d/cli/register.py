@@ -172,6 +172,10 @@ _NEXT = {
 }
 """What to do, by status, where the reasons do not say it."""
 
+_NEXT_SCALE = (
+    "have the ratio of the lengths estimated too (--estimate-scale), or bring both to one scale first"
+)
+
 
 def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: bool, unit: str) -> None:
     if as_json:
@@ -186,7 +190,10 @@ def _print(answer: RegistrationResult, as_json: bool, quiet: bool, inverted: boo
         color = False if os.environ.get("NO_COLOR") else None
         click.echo(summary(answer, inverted, unit), color=color)
         if answer.has_transform and answer.status in _NEXT:
-            click.echo(f"\nnext: {_NEXT[answer.status]}")
+            from geomoe3d.decision.scale import DIFFERS
+
+            scaled = answer.scale == 1.0 and any(reason.startswith(DIFFERS) for reason in answer.reasons)
+            click.echo(f"\nnext: {_NEXT_SCALE if scaled else _NEXT[answer.status]}")
 
 
 def _check_outputs(outputs: _Outputs, inputs: Sequence[str], scale: float | None, force: bool) -> None:

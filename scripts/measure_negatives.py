@@ -24,12 +24,11 @@ import click
 import numpy as np
 from measure_multiway import dev_rooms, generated_rooms
 
-from geomoe3d.batch.mix import share_that_belongs
+from geomoe3d.batch.mix import beside_others, share_that_belongs
 from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import find_data_root
 from geomoe3d.decision.confidence import prior_logit
-from geomoe3d.decision.repeat import logit
 from geomoe3d.evaluation.intervals import wilson
 from geomoe3d.geometry.se3 import inverse, rotation_error_deg, translation_error
 from geomoe3d.registration import Registrar
@@ -117,10 +116,9 @@ def _is_right(T: FloatArray, truth: FloatArray | None) -> bool:
 
 def _tell(group: str, lines: list[dict[str, Any]]) -> None:
     surely = [line for line in lines if line["confidence"] >= 0.95]
-    confidences = np.array([line["confidence"] for line in lines])
-    share = share_that_belongs(confidences)
-    among = 1 / (1 + np.exp(-np.array([logit(value) for value in confidences]) - min(prior_logit(share), 0)))
-    still = [line["right"] for line, value in zip(lines, among, strict=True) if value >= 0.95]
+    share = share_that_belongs(np.array([line["confidence"] for line in lines]))
+    added = prior_logit(share)
+    still = [line["right"] for line in lines if beside_others(line["confidence"], added) >= 0.95]
     accepted = [line for line in lines if line["status"] == "ok"]
     right = sum(line["right"] for line in accepted)
     low, high = wilson(right / len(accepted), len(accepted)) if accepted else (0.0, 100.0)

@@ -47,7 +47,7 @@ def shared_out(
     added = prior_logit(share_that_belongs(alone))
     if added >= 0:
         return unchanged, None
-    share = float(np.mean([_beside(value, added) for value in np.sort(alone)]))
+    share = float(np.mean([beside_others(value, added) for value in np.sort(alone)]))
     least = config.decision.min_confidence
     return {name: _less_sure(record, added, share, least) for name, record in unchanged.items()}, share
 
@@ -70,8 +70,8 @@ def share_that_belongs(confidences: FloatArray) -> float:
     return share
 
 
-def _beside(alone: float, added: float) -> float:
-    """A confidence among the others, never above what it was."""
+def beside_others(alone: float, added: float) -> float:
+    """A confidence where the prior adds so much to its logit (`prior_logit`), never above what it was alone."""
     return min(alone, float(1 / (1 + np.exp(-logit(alone) - added))))
 
 
@@ -80,7 +80,7 @@ def _less_sure(record: Record, added: float, share: float, least: float) -> Reco
     if result is None:
         return record
     alone = result["confidence"]
-    confidence = _beside(alone, added)
+    confidence = beside_others(alone, added)
     evidence = {**result["evidence"], ALONE: alone}
     result = {**result, "confidence": confidence, "evidence": evidence}
     if result["status"] == "ok" and confidence < least:

@@ -77,7 +77,7 @@ def test_relations_turn_with_the_cloud(pair) -> None:
         replace(level, points=level.points @ R.T, normals=level.normals @ R.T) for level in (at, middle)
     ]
     assert np.array_equal(distance, np.sort(distance, axis=1))
-    assert np.allclose(relations(*turned, rows), relations(at, middle, rows), atol=2e-4)
+    assert np.allclose(relations(*turned, rows.T), relations(at, middle, rows.T), atol=2e-4)
 
 
 def test_levels_are_coarser_by_their_factor(pair) -> None:
@@ -188,7 +188,7 @@ def test_relations_in_torch_are_those_of_registration(pair) -> None:
         for level in (at, middle)
     ]
     found = torch_relations(grids[0], grids[1], torch.from_numpy(rows)).numpy()
-    assert np.allclose(found, relations(at, middle, rows), atol=1e-5)
+    assert np.allclose(found.swapaxes(0, 1), relations(at, middle, rows.T), atol=1e-5)
 
 
 def test_a_batch_of_views_is_each_of_them(shards: Path) -> None:

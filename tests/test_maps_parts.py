@@ -127,11 +127,12 @@ def test_on_a_part_of_a_map_the_sensors_of_the_whole_are_asked(monkeypatch):
 
     asked = []
 
-    def search(line, scan, compared, level, own, clock, sight=None):
+    def search(line, scan, compared, level, own, clock, sight=None, cells=None):
         asked.append((level, sight))
         return SimpleNamespace(level=level, query=SimpleNamespace(num_windows=1), candidates=lambda **_: [])
 
-    monkeypatch.setattr(finding, "prepare", lambda *_, **__: None)
+    monkeypatch.setattr(finding, "prepare", lambda *_, **__: SimpleNamespace(points=inside))
+    monkeypatch.setattr(finding, "compared_rows", lambda _: np.arange(len(inside)))
     monkeypatch.setattr(finding, "described", lambda *_: (None, None))
     monkeypatch.setattr(finding, "Search", search)
     monkeypatch.setattr(finding.Finder, "_around", lambda *_: part)

@@ -98,7 +98,7 @@ def _own_sizes(cloud: PointCloud, counts: Sequence[int]) -> list[float]:
         # Where foliage fills space, a grid for surfaces shows next to nothing of it.
         return max(size / 2 if size > least and _fills_space(cloud.points, size) else size, least)
 
-    return [of(num_points) for num_points in counts]
+    return each(of, counts)
 
 
 def _size_for_count(points: FloatArray, num_points: int) -> float:

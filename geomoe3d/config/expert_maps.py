@@ -102,13 +102,15 @@ class MapsExpert(Section):
 class PlacesExpert(Section):
     """Windows of a map and the transforms proposed in them (`maps/places.py`)."""
 
-    asked: int = constant(1000, "points", (10, 1_000_000), "of the scan that are matched")
+    asked: tuple[Annotated[int, Field(ge=10, le=1_000_000)], Annotated[int, Field(ge=10, le=1_000_000)]] = (
+        constant((600, 1000), "points", None, "of the scan that are matched, at first and later")
+    )
     reach: float = constant(0.95, "share", (0, 1), "of the scan's points within its radius")
     cell: float = constant(2 / 3, "radii", (0.01, 10), "edge of the cells of which windows are made")
     window: float = constant(1.25, "radii", (0.1, 10), "of a window, between the corners of its cells")
     apart: float = constant(0.6, "radii", (0, 10), "between the centres of two windows at least")
     voting: int = constant(
-        200,
+        150,
         "points",
         (10, 1_000_000),
         "of these that vote for windows",
@@ -151,7 +153,9 @@ class PlacesExpert(Section):
 class LocatingExpert(Section):
     """Which places are looked at, and what is said of them (`maps/locate.py`)."""
 
-    first_windows: int = constant(6, "windows", (1, 10_000), "that are looked into in any case")
+    first_windows: tuple[Annotated[int, Field(ge=1, le=10_000)], Annotated[int, Field(ge=1, le=10_000)]] = (
+        constant((4, 6), "windows", None, "that are looked into in any case, at first and later")
+    )
     windows: int = constant(12, "windows", (1, 10_000), "that are looked into at first")
     more_windows: int = constant(
         24, "windows", (1, 10_000), "that are looked into where the first look is not ok"
@@ -210,7 +214,7 @@ class LocatingExpert(Section):
         0.4, "share", (0, 1), "of the best candidate's quick score, from which one is drawn closer"
     )
     polishing: Annotated[tuple[Annotated[float, Field(ge=0.1, le=100)], ...], Field(min_length=1)] = constant(
-        (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0),
+        (6.0, 5.0, 4.0, 3.0, 2.0, 2.0),
         "voxels",
         None,
         "within which points are matched, step by step",

@@ -31,6 +31,8 @@ NUM_NEIGHBORS = 16
 LEARNED = 32
 DIMENSION = LEARNED + 33
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
+_TOGETHER, _NEAR = 1024, 256
+"""Points that one thread works on at a time; of these, as many as stay near a core with what their neighbours hold."""
 
 
 @descriptor("learned")
@@ -91,17 +93,28 @@ class _Network:
         """(m, 32) unit features of some points of the finest level."""
         whole, middle, coarse = self._levels
         fine = whole.take(rows)
-        own = [self._mlp(f"embed.{k}", self._given(level)) for k, level in enumerate((fine, middle, coarse))]
-        held = self._look("middle_middle", middle, middle, own[1], own[1])
-        wide = self._look("coarse_middle", coarse, middle, own[2], held)
-        wide = self._look("coarse_coarse", coarse, coarse, wide, wide)
-        near = self._look("fine_middle", fine, middle, own[0], held)
-        far = self._look("fine_coarse", fine, coarse, near, wide)
-        found = self._mlp("head", np.hstack([own[0], near, far]))
-        unit: Float32Array = found / np.maximum(
-            np.linalg.norm(found, axis=1, keepdims=True), np.float32(1e-12)
-        )
-        return unit
+
+        def around(at: Level, of: Level) -> IntArray:
+            return np.ascontiguousarray(nearest(at, of, NUM_NEIGHBORS)[1].T)
+
+        own = [self._mlp(f"embed.{k}", self._given(level)) for k, level in ((1, middle), (2, coarse))]
+        held = self._look("middle_middle", middle, middle, around(middle, middle), own[0], own[0])
+        wide = self._look("coarse_middle", coarse, middle, around(coarse, middle), own[1], held)
+        wide = self._look("coarse_coarse", coarse, coarse, around(coarse, coarse), wide, wide)
+        # Of all points at once, since these searches share their work among threads by themselves.
+        in_middle, in_coarse = around(fine, middle), around(fine, coarse)
+
+        def part(start: int) -> Float32Array:
+            chunk = slice(start, start + _TOGETHER)
+            some = fine.take(chunk)
+            own = self._mlp("embed.0", self._given(some))
+            near = self._look("fine_middle", some, middle, in_middle[:, chunk], own, held)
+            far = self._look("fine_coarse", some, coarse, in_coarse[:, chunk], near, wide)
+            found = self._mlp("head", np.hstack([own, near, far]))
+            found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), np.float32(1e-12))
+            return found
+
+        return np.concatenate(each(part, range(0, len(rows), _TOGETHER)))
 
     def _given(self, level: Level) -> Float32Array:
         """What a point begins with: the cloud's own FPFH there, on coarser levels also that of the level."""
@@ -109,27 +122,43 @@ class _Network:
         return of_cloud if level.edge == FACTORS[0] else np.hstack([of_cloud, level.features])
 
     def _look(
-        self, name: str, at: Level, of: Level, held: Float32Array, of_held: Float32Array
+        self, name: str, at: Level, of: Level, rows: IntArray, held: Float32Array, of_held: Float32Array
     ) -> Float32Array:
-        """What the points of ``at`` hold after a look at their neighbours among ``of``."""
-        _, rows = nearest(at, of, NUM_NEIGHBORS)
-        here = self._linear(f"{name}.here", held)
+        """What the points of ``at`` hold after a look at their neighbours among ``of``, ``rows`` (k, m)."""
         there = self._linear(f"{name}.there", of_held)
 
-        size = 256  # points at a time: what they and their neighbours hold stays near a core
-
         def part(start: int) -> Float32Array:
-            chunk = slice(start, start + size)
-            # Neighbours come first: the largest and the mean over them are then quick to take.
-            lie = relations(at.take(chunk), of, rows[chunk]).swapaxes(0, 1)
-            seen = self._linear(f"{name}.lie", np.ascontiguousarray(lie))
-            seen += there[rows[chunk].T]
-            seen += here[chunk]
-            np.maximum(seen, 0, out=seen)
-            return np.hstack([seen.max(0), seen.mean(0), held[chunk]])
+            chunk = slice(start, start + _TOGETHER)
+            lie = relations(at.take(chunk), of, rows[:, chunk])
+            return self._looked(name, lie, rows[:, chunk], held[chunk], there)
 
-        joined = np.concatenate(each(part, range(0, len(at), size)))
-        return held + self._mlp(f"{name}.out", joined, normalised=True)
+        return np.concatenate(each(part, range(0, len(at), _TOGETHER)))
+
+    def _looked(
+        self, name: str, lie: Float32Array, rows: IntArray, held: Float32Array, there: Float32Array
+    ) -> Float32Array:
+        """`_look` of some points: how their neighbours lie (k, m, 8), what they hold, what all others show."""
+        from scipy.linalg.blas import sgemm
+
+        here = self._linear(f"{name}.here", held) + self._tensors[f"{name}.lie.bias"]
+        weights = self._tensors[f"{name}.lie.weight"]
+        largest, mean = np.empty_like(here), np.empty_like(here)
+        for start in range(0, len(held), _NEAR):
+            near = slice(start, start + _NEAR)
+            # Neighbours come first: the largest and the mean over them are then quick to take.
+            seen = there.take(rows[:, near], axis=0)
+            lies, sums = (x.reshape(-1, x.shape[2]) for x in (lie[:, near], seen))
+            # Added in the place of what others show. BLAS counts the other way round.
+            added = sgemm(1.0, weights.T, lies.T, beta=1.0, c=sums.T, overwrite_c=1, trans_a=1)
+            seen = added.T.reshape(seen.shape)
+            # Of x + h what is positive is the larger one of x and -h, plus h.
+            np.maximum(seen, -here[near], out=seen)
+            seen.max(0, out=largest[near])
+            np.add.reduce(seen, axis=0, out=mean[near])
+        mean *= np.float32(1 / len(rows))
+        largest += here
+        mean += here
+        return held + self._mlp(f"{name}.out", np.hstack([largest, mean, held]), normalised=True)
 
     def _mlp(self, name: str, x: Float32Array, *, normalised: bool = False) -> Float32Array:
         """Linear, layer norm if ``normalised``, what is positive, linear."""
@@ -138,13 +167,16 @@ class _Network:
             x -= x.mean(1, keepdims=True)
             # As torch's layer norm.
             x /= np.sqrt(np.mean(x * x, axis=1, keepdims=True) + np.float32(1e-5))
-            x = x * self._tensors[f"{name}.1.weight"] + self._tensors[f"{name}.1.bias"]
-        return self._linear(f"{name}.3" if normalised else f"{name}.2", np.maximum(x, 0))
+            x *= self._tensors[f"{name}.1.weight"]
+            x += self._tensors[f"{name}.1.bias"]
+        return self._linear(f"{name}.3" if normalised else f"{name}.2", np.maximum(x, 0, out=x))
 
     def _linear(self, name: str, x: Float32Array) -> Float32Array:
         y: Float32Array = x @ self._tensors[f"{name}.weight"].T
         bias = self._tensors.get(f"{name}.bias")
-        return y if bias is None else y + bias
+        if bias is not None:
+            y += bias
+        return y
 
 
 def load_tensors(path: Path) -> dict[str, Float32Array]:

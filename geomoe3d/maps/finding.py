@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from typing import Any, Literal
 
@@ -21,10 +22,12 @@ from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.se3 import motions_apart, shift_frames, transform_points
 from geomoe3d.maps.detail import Detail, Fitting
-from geomoe3d.maps.level import Level, described
+from geomoe3d.maps.level import Level, compared_rows, described
 from geomoe3d.maps.locate import Found, Search, likely
+from geomoe3d.maps.places import Cells, radius_of
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.pipeline import Pipeline
+from geomoe3d.runtime.threads import beside
 from geomoe3d.runtime.timing import StageClock
 from geomoe3d.types import FloatArray, Hypothesis, PointCloud, PreparedCloud
 
@@ -129,7 +132,9 @@ class Finder:
             first = max(found, key=attrgetter("score"))
             if first.stood and look != "finer":
                 answers = [f.decision.answer for f in found if f.decision.answer is not None]
-                twins = whole.twins(first.decision.T_target_source, count)
+                T = first.decision.T_target_source
+                twins, measured = beside(partial(whole.twins, T, count), first.measured)
+                found = [measured if f is first else f for f in found]
                 twins = [T for T in twins if all(whole.differ(Hypothesis(T), answer) for answer in answers)]
                 if where is not None:  # of rooms that are alike, the caller says in which the scan is
                     twins = [T for T in twins if search.is_near(T, where)]
@@ -206,8 +211,12 @@ class Finder:
         config, seed = self._prepared_as(cloud), self.line.config.seed
         bare = prepare(cloud, level.voxel_size, config, viewpoint=view, seed=seed)
         clock("features")
-        scan, compared = described(bare, self.line.descriptor)
-        return Search(self.line, scan, compared, level, self._part(level), clock, sight)
+        rows = compared_rows(bare)
+        (scan, compared), cells = beside(
+            lambda: described(bare, self.line.descriptor, rows),
+            lambda: Cells.of(level.compared, radius_of(bare.points[rows])),
+        )
+        return Search(self.line, scan, compared, level, self._part(level), clock, sight, cells)
 
     def _part(self, level: Level) -> PreparedCloud:
         nothing = np.zeros((0, 3))

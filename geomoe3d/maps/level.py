@@ -168,9 +168,8 @@ class Level:
         )
 
 
-def described(scan: PreparedCloud, describe: Descriptor) -> tuple[PreparedCloud, Compared]:
-    """A scan with the features of a descriptor, and what is compared of it with a map. Raises EmptyCloudError: that
-    is fewer than 3 points."""
+def compared_rows(scan: PreparedCloud) -> IntArray:
+    """(k,) which points of a scan are compared with a map. Raises EmptyCloudError: fewer than 3."""
     rows = one_per_voxel(scan, SPACING)
     if len(rows) < (least := expert().maps.least_points):
         raise EmptyCloudError(
@@ -178,6 +177,11 @@ def described(scan: PreparedCloud, describe: Descriptor) -> tuple[PreparedCloud,
             f"a {SPACING * scan.voxel_size:.4g} grid, at least {least} are needed; give a denser scan or a voxel size "
             "that fits it"
         )
+    return rows
+
+
+def described(scan: PreparedCloud, describe: Descriptor, rows: IntArray) -> tuple[PreparedCloud, Compared]:
+    """A scan with the features of a descriptor, and what is compared of it with a map, by `compared_rows`."""
     found = with_features(scan, describe)
     fpfh = found.features if describe == FpfhDescriptor() else None
     features = LearnedDescriptor().at(pyramid(scan, fpfh), rows)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,18 +22,18 @@ from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.accuracy import measure_accuracy
 from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement, judge, lead_over
-from geomoe3d.decision.scale import measure_scale
+from geomoe3d.decision.scale import Scale, measure_scale
 from geomoe3d.decision.selection import Selection, surfaces_of
 from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
 from geomoe3d.maps.level import Compared, Level
-from geomoe3d.maps.places import Query, Window, likest
+from geomoe3d.maps.places import Cells, Query, Window, likest
 from geomoe3d.maps.sight import Sight, seen_factor
 from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import ahead, beside, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import Accuracy, FloatArray, Hypothesis, PreparedCloud
 
 ANOTHER_STANDS = (
     "at another place the scan would be ok too, were it not for this one: rooms may be copies of each other"
@@ -48,12 +49,14 @@ class Found:
         decision: of the ordinary line there.
         sure: whether it was ok beside all rivals, before the scale was measured: more looks cannot help then.
         stood: whether it was ok before it had rivals elsewhere.
+        measures: the scale and the accuracy of its answer, where somebody measured them.
     """
 
     pair: Pair
     decision: Decision
     sure: bool = False
     stood: bool = False
+    measures: tuple[Scale | None, Accuracy | None] | None = None
 
     @property
     def score(self) -> float:
@@ -64,6 +67,17 @@ class Found:
     def confidence(self) -> float:
         """Of the decision."""
         return self.decision.judgement.confidence
+
+    def measured(self) -> Found:
+        """The same with its measures."""
+        if self.measures is not None or self.decision.answer is None:
+            return self
+        T, shared = self.decision.T_target_source, SharedSurface(*self.pair.clouds)
+        measures = beside(
+            lambda: measure_scale(T, shared),
+            lambda: measure_accuracy(T, shared, self.pair.matched, self.pair.inlier_threshold),
+        )
+        return replace(self, measures=measures)
 
 
 class Search:
@@ -78,6 +92,7 @@ class Search:
         clock: told of the stages.
         sight: the map as a whole where ``level`` is a part of it: its sensors are asked there, since in the part alone
             they would seem to have looked through walls that were cut away. None: the level.
+        cells: as of `Query`.
     """
 
     def __init__(
@@ -89,6 +104,7 @@ class Search:
         part: PreparedCloud,
         clock: StageClock,
         sight: Level | None = None,
+        cells: Cells | None = None,
     ) -> None:
         self._sight = level if sight is None else sight
         self._line, self.level, self._part, self._clock = line, level, part, clock
@@ -103,7 +119,7 @@ class Search:
         margin = expert().locating.margin * scan.voxel_size
         self._box = scan.points.min(0) - margin, scan.points.max(0) + margin
         clock("places")
-        self.query = Query(compared, level, seed=self.config.seed)
+        self.query = Query(compared, level, seed=self.config.seed, cells=cells)
         rng = np.random.default_rng(self.config.seed)
         self._rows = np.sort(rng.permutation(len(scan))[: expert().locating.asked])
         self._order = rng.permutation(len(level.points))
@@ -224,7 +240,10 @@ class Search:
         found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
         motions = ahead(lambda w: self.query.motions(w, known.per_window[more], more=more), windows)
         for number, window in enumerate(windows):
-            if number >= times * known.first_windows and max((q for q, _ in scored), default=0.0) > plain:
+            if (
+                number >= times * known.first_windows[more]
+                and max((q for q, _ in scored), default=0.0) > plain
+            ):
                 break
             if found is not None and window.votes < known.rival_votes * found[0]:
                 break
@@ -234,7 +253,8 @@ class Search:
             if near is not None:
                 proposed = [h for h in proposed if self.is_near(h.T_target_source, near)]
             least = known.worth_polishing * max((q for q, _ in scored), default=0.0)
-            fresh = [(self.quick(h.T_target_source, least), h) for h in proposed]
+            quick = each(partial(self.quick, least=least), [h.T_target_source for h in proposed])
+            fresh = list(zip(quick, proposed, strict=True))
             scored += fresh
             best = max(fresh, key=lambda item: item[0], default=None)
             if found is None and times == 1.0 and best is not None and best[0] > max(plain, known.plainest):
@@ -302,22 +322,20 @@ class Search:
             judgement = Judgement("ambiguous", reasons, min(judgement.confidence, most))
             sure = False
         decision = replace(best.decision, alternative=rival, lead=lead, judgement=judgement)
-        T, pair = decision.T_target_source, best.pair
+        pair = best.pair
         decision = shown(self._line, pair, decision, self._clock)
         sure = sure and decision.judgement.status == "ok"
         if answer.note is not None:
             decision = decision.with_note(answer.note)
         self._clock("decide")
-        shared = SharedSurface(*pair.clouds)
-        scale, told = beside(
-            lambda: measure_scale(T, shared),
-            lambda: measure_accuracy(T, shared, pair.matched, pair.inlier_threshold),
-        )
+        measures = best.measured().measures
+        assert measures is not None  # there is an answer
+        scale, told = measures
         if scale is not None:  # maps are bent where their scans were joined
             scale = replace(scale, sigma=expert().locating.scale_deviation * scale.sigma)
         decision = decision.with_scale(scale, (pair.clouds[0].name, pair.clouds[1].name))
         stood = best.decision.judgement.status == "ok"
-        return Found(pair, replace(decision, accuracy=told), sure, stood), distinct
+        return Found(pair, replace(decision, accuracy=told), sure, stood, measures), distinct
 
     def is_near(self, T: FloatArray, near: tuple[FloatArray, float]) -> bool:
         """Whether a transform (4, 4) puts the scan's sensor where it is said to be; ``near`` as of `candidates`."""

@@ -50,10 +50,17 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
-    """What is compared of a map, cell by cell: its rows in that order, where each cell begins, and the features (c, 65)
-    in that order; and of the window around each of w cells: the cells of all windows, one after another, where each
-    window begins and ends there (w + 1), and its centre (w, 3)."""
+class Cells:
+    """What is compared of a map, cell by cell, for scans of one radius.
+
+    Attributes:
+        order: (c,) its rows in that order.
+        starts: where each cell begins.
+        members, windows: the cells of the window around each of w cells, one window after another, and where each
+            window begins and ends there (w + 1).
+        centers: (w, 3) of the windows, local coordinates.
+        features: (c, 65) in that order.
+    """
 
     order: IntArray
     starts: IntArray
@@ -61,6 +68,36 @@ class _Cells:
     windows: IntArray
     centers: FloatArray
     features: Float32Array
+
+    @classmethod
+    def of(cls, compared: Compared, radius: float) -> Cells:
+        """The cells of a map for scans of a radius, by `radius_of`."""
+        from scipy.spatial import cKDTree
+
+        edge = expert().places.cell * radius
+        cells = np.floor(compared.points / edge).astype(np.int64)
+        cells -= cells.min(0)
+        shape = tuple(cells.max(0) + 1)
+        flat = np.ravel_multi_index(tuple(cells.T), shape)
+        order = np.argsort(flat, kind="stable")
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
+        places = np.stack(np.unravel_index(flat[order][starts], shape), axis=1)
+        around = cKDTree(places).query_ball_point(
+            places, expert().places.window * radius / edge + 1e-6, return_sorted=True
+        )
+        members = np.concatenate(around).astype(np.int64)
+        windows = np.cumsum([0, *map(len, around)])
+        counts = np.diff(np.append(starts, len(order)))
+        sums = np.add.reduceat(compared.points[order], starts, axis=0)
+        counted = np.add.reduceat(counts[members], windows[:-1])[:, None]
+        centers = np.add.reduceat(sums[members], windows[:-1], axis=0) / counted
+        return cls(order, starts, members, windows, centers, compared.features[order])
+
+
+def radius_of(points: FloatArray) -> float:
+    """Within which the compared points (n, 3) of a scan lie around their mean, but for strays."""
+    away = np.linalg.norm(points - points.mean(0), axis=1)
+    return float(np.quantile(away, expert().places.reach))
 
 
 class Query:
@@ -70,16 +107,22 @@ class Query:
         scan: normals turned to its sensor.
         level: of the map, on the scan's grid.
         seed: decides which points are asked.
+        cells: of the map for the scan's radius; None: made when windows are asked for.
     """
 
-    def __init__(self, scan: Compared, level: Level, *, seed: int = 0) -> None:
+    def __init__(self, scan: Compared, level: Level, *, seed: int = 0, cells: Cells | None = None) -> None:
         self.level, self.seed = level, seed
-        self._scan = scan.take(
-            np.sort(np.random.default_rng(seed).permutation(len(scan.points))[: expert().places.asked])
-        )
-        self.radius = float(
-            np.quantile(np.linalg.norm(scan.points - scan.points.mean(0), axis=1), expert().places.reach)
-        )
+        drawn = np.random.default_rng(seed).permutation(len(scan.points))
+        few, many = (np.sort(drawn[:asked]) for asked in expert().places.asked)
+        self._scan = scan.take(many)
+        self._few = scan.take(few)
+        self.radius = radius_of(scan.points)
+        self._given_cells = cells
+
+    @cached_property
+    def _cells(self) -> Cells:
+        given = self._given_cells
+        return Cells.of(self.level.compared, self.radius) if given is None else given
 
     @single_blas_thread()
     def windows(
@@ -131,29 +174,6 @@ class Query:
         """Of the map, also those that overlap."""
         return len(self._cells.centers)
 
-    @cached_property
-    def _cells(self) -> _Cells:
-        from scipy.spatial import cKDTree
-
-        level, edge = self.level.compared, expert().places.cell * self.radius
-        cells = np.floor(level.points / edge).astype(np.int64)
-        cells -= cells.min(0)
-        shape = tuple(cells.max(0) + 1)
-        flat = np.ravel_multi_index(tuple(cells.T), shape)
-        order = np.argsort(flat, kind="stable")
-        starts = np.flatnonzero(np.concatenate([[True], np.diff(flat[order]) > 0]))
-        places = np.stack(np.unravel_index(flat[order][starts], shape), axis=1)
-        around = cKDTree(places).query_ball_point(
-            places, expert().places.window * self.radius / edge + 1e-6, return_sorted=True
-        )
-        members = np.concatenate(around).astype(np.int64)
-        windows = np.cumsum([0, *map(len, around)])
-        counts = np.diff(np.append(starts, len(order)))
-        sums = np.add.reduceat(level.points[order], starts, axis=0)
-        counted = np.add.reduceat(counts[members], windows[:-1])[:, None]
-        centers = np.add.reduceat(sums[members], windows[:-1], axis=0) / counted
-        return _Cells(order, starts, members, windows, centers, level.features[order])
-
     def motions(
         self, window: Window, count: int, *, more: bool = False, mutual: bool = False
     ) -> list[Hypothesis]:
@@ -165,7 +185,8 @@ class Query:
             more: from more matches and seeds: two to four times as long, and more is found.
             mutual: from matches alone that are each other's best: a third of the time, enough for what is alike.
         """
-        scan, there, known = self._scan, self.level.compared.take(window.keys), expert().places
+        known, there = expert().places, self.level.compared.take(window.keys)
+        scan = self._scan if more else self._few
         # A small scan has few points to match, and of their first choices too few are right.
         choices = 1 if mutual else min(known.choices, math.ceil(known.matches[more] / len(scan.points)))
         index, distance, _, both = nearest_features(scan.features, there.features, choices, False)

@@ -200,17 +200,18 @@ def _one_room(seed: int) -> Scene:
     raise RuntimeError(f"no single room among a hundred of seed {seed}")
 
 
-def tasks(cases: list[str]) -> Iterator[Task]:
-    """The maps of some cases."""
+def tasks(cases: list[str], begin: int = 0) -> Iterator[Task]:
+    """The maps of some cases; ``begin``: seed of the first room of generated buildings, for other ones."""
     if set(cases) & {"room", "three", "feet"}:
         yield from _of_rooms(Scenes(), cases)
     if "stranger" in cases:
         yield from _of_strangers(Scenes())
     for case in ("building", "alike", "large"):
         if case in cases:
-            made = Building(case == "alike")
+            made = Building(case == "alike", begin=begin)
+            other = f" {begin}" if begin else ""
             queries = [
-                Query(f"{case}/rooms/{room + ALIKE * again}", partial(made.view, room, again))
+                Query(f"{case}{other}/rooms/{room + ALIKE * again}", partial(made.view, room, again))
                 for room, again in (made.asked if case != "large" else made.asked[::2])
             ]
             yield Task(case, made.cloud, queries, made)

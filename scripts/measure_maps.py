@@ -1,7 +1,7 @@
 """Scans in maps: one room, three rooms side by side, scans of another building, generated buildings; peers beside.
 
     python scripts/measure_maps.py OUT [--cases room three stranger feet building alike large world] [--methods geomoe3d
-        kiss-matcher open3d-feature-ransac] [--every 1]
+        kiss-matcher open3d-feature-ransac] [--every 1] [--begin 0]
 
 The rooms are three dev scenes of 3DMatch, each merged by its published poses; 60 fragments are asked for, 20 of each.
 They are left out in five turns: a map holds none of the twelve fragments asked for in its turn. Side by side the rooms
@@ -154,12 +154,15 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument(
+        "--begin", type=int, default=0, help="seed of the first room of generated buildings: another building"
+    )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "queries.jsonl"
     done = {(line["key"], line["method"]) for line in read_journal(path)}
     with Journal(path) as journal:
-        for task in tasks(options.cases):
+        for task in tasks(options.cases, options.begin):
             chosen = task.queries[:: options.every]
             methods = [OURS] if task.case in ("large", "feet") else options.methods
             open_ones = [(q, m) for q in chosen for m in methods if (q.key, m) not in done]

@@ -217,14 +217,14 @@ class ScaleExpert(Section):
         "32 right answers of both benchmarks that 2.6 denied: 18 have it; of 20 pairs scaled by 1.02 one more is ok",
     )
     unheard_of: float = constant(
-        0.06,
+        0.05,
         "ln(ratio)",
         (0, 1),
         "beyond it half as many standard deviations do",
         "right answers on real fragments, firmly measured, are hardly off by more than 5 per cent",
     )
     firm: float = constant(
-        0.05, "ln(ratio)", (0, 1), "but only where the deviation is below this", _REAL_PAIRS
+        0.08, "ln(ratio)", (0, 1), "but only where the deviation is below this", _REAL_PAIRS
     )
     unit_tolerance: float = constant(0.02, "ln(ratio)", (0, 0.5), "within which a ratio is that of two units")
     extent_tolerance: float = constant(

@@ -39,8 +39,8 @@ class Scale:
     @property
     def differs(self) -> bool:
         """Whether the ratio is off 1 by more than one per cent and by more standard deviations than chance gives: 3.5
-        below 3.5 per cent, by which fragments of one camera differ, else 2.6, and 1.3 beyond six per cent where the
-        deviation is under five."""
+        below 3.5 per cent, by which fragments of one camera differ, else 2.6, and 1.3 beyond five per cent where the
+        deviation is under eight."""
         off, known = abs(float(np.log(self.ratio))), expert().scale
         enough = known.significant
         if off < known.usual:

@@ -129,7 +129,7 @@ def test_on_a_part_of_a_map_the_sensors_of_the_whole_are_asked(monkeypatch):
 
     def search(line, scan, compared, level, own, clock, sight=None, cells=None):
         asked.append((level, sight))
-        return SimpleNamespace(level=level, query=SimpleNamespace(num_windows=1), candidates=lambda **_: [])
+        return SimpleNamespace(level=level, has_many_places=False, candidates=lambda **_: [])
 
     monkeypatch.setattr(finding, "prepare", lambda *_, **__: SimpleNamespace(points=inside))
     monkeypatch.setattr(finding, "compared_rows", lambda _: np.arange(len(inside)))

@@ -110,7 +110,7 @@ class PlacesExpert(Section):
     window: float = constant(1.25, "radii", (0.1, 10), "of a window, between the corners of its cells")
     apart: float = constant(0.6, "radii", (0, 10), "between the centres of two windows at least")
     voting: int = constant(
-        150,
+        200,
         "points",
         (10, 1_000_000),
         "of these that vote for windows",
@@ -154,7 +154,12 @@ class LocatingExpert(Section):
     """Which places are looked at, and what is said of them (`maps/locate.py`)."""
 
     first_windows: tuple[Annotated[int, Field(ge=1, le=10_000)], Annotated[int, Field(ge=1, le=10_000)]] = (
-        constant((4, 6), "windows", None, "that are looked into in any case, at first and later")
+        constant(
+            (4, 6),
+            "windows",
+            None,
+            "that are looked into in any case, at first, and later and in maps of many places",
+        )
     )
     windows: int = constant(12, "windows", (1, 10_000), "that are looked into at first")
     more_windows: int = constant(

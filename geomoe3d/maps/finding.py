@@ -83,7 +83,7 @@ class Finder:
         own, coarsest = self._grids(cloud)
         whole = self._begun(cloud, view, self.level_for(own, coarsest, expert().maps.asked_points), clock)
         search, twinned = whole, False
-        many = whole.query.num_windows >= expert().detail.many_places
+        many = whole.has_many_places
         detail: Detail | None = None
         fitting: Fitting = []
         known: list[FloatArray] = []

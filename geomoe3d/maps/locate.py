@@ -125,6 +125,11 @@ class Search:
         self._order = rng.permutation(len(level.points))
         self._view = None if scan.viewpoint is None else RangeImage.of(scan.points, scan.viewpoint)
 
+    @property
+    def has_many_places(self) -> bool:
+        """Whether the map has very many windows, of which the scan may look like several."""
+        return self.query.num_windows >= expert().detail.many_places
+
     def candidates(
         self,
         *,
@@ -241,7 +246,7 @@ class Search:
         motions = ahead(lambda w: self.query.motions(w, known.per_window[more], more=more), windows)
         for number, window in enumerate(windows):
             if (
-                number >= times * known.first_windows[more]
+                number >= times * known.first_windows[more or self.has_many_places]
                 and max((q for q, _ in scored), default=0.0) > plain
             ):
                 break

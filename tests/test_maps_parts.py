@@ -144,6 +144,32 @@ def test_on_a_part_of_a_map_the_sensors_of_the_whole_are_asked(monkeypatch):
     assert asked == [(whole, None), (part, whole)]
 
 
+def test_what_fits_in_detail_is_looked_at_also_where_no_finer_grid_can_be_made(monkeypatch):
+    """A view of a large part of a building: around its place are too many points for a finer grid than the map's."""
+    fits, asked = make_transform(np.eye(3), (1.0, 2.0, 3.0)), []
+
+    def candidates(*, given=(), **_):
+        asked.append(list(given))
+        return []
+
+    nothing = SimpleNamespace(answer=None, judgement=SimpleNamespace(confidence=0.0))
+    looked = finding.Found(None, nothing)
+    level = SimpleNamespace(voxel_size=0.2, compared=None)
+    search = SimpleNamespace(level=level, has_many_places=True, candidates=candidates)
+    search.look, search.decide = lambda *_, **__: looked, lambda found: (found[0], [])
+    detail = SimpleNamespace(ordered=lambda _, best, others: (best, others))
+    monkeypatch.setattr(finding.Finder, "_begun", lambda *_: search)
+    monkeypatch.setattr(finding.Finder, "_around", lambda *_: None)
+    monkeypatch.setattr(finding.Finder, "_in_detail", lambda *_: (detail, [(0.97, fits), (0.6, np.eye(4))]))
+    line = SimpleNamespace(config=RegistrationConfig(), descriptor=None)
+    finder = finding.Finder(line, VoxelSums.empty(0.1, np.zeros(3)), lambda *_: level, "map")
+    scan = PointCloud(np.random.default_rng(3).uniform(-1, 1, (50, 3)), np.zeros(3))
+    assert finder(scan, scan, [], None, 4, StageClock()) == (None, [])
+    first, last = asked
+    assert first == []
+    assert [T.tolist() for T in last] == [fits.tolist()]
+
+
 def test_voxels_are_those_of_the_whole_in_whatever_pieces():
     points = np.random.default_rng(1).uniform(-3, 3, (3000, 3))
     whole = VoxelSums.empty(0.5, np.zeros(3)).added(points)

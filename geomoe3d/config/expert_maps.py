@@ -103,7 +103,12 @@ class PlacesExpert(Section):
     """Windows of a map and the transforms proposed in them (`maps/places.py`)."""
 
     asked: tuple[Annotated[int, Field(ge=10, le=1_000_000)], Annotated[int, Field(ge=10, le=1_000_000)]] = (
-        constant((600, 1000), "points", None, "of the scan that are matched, at first and later")
+        constant(
+            (600, 1000),
+            "points",
+            None,
+            "of the scan that are matched, at first, and later and in maps of many places",
+        )
     )
     reach: float = constant(0.95, "share", (0, 1), "of the scan's points within its radius")
     cell: float = constant(2 / 3, "radii", (0.01, 10), "edge of the cells of which windows are made")

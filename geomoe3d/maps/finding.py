@@ -91,7 +91,7 @@ class Finder:
         best: Found | None = None
         ranked: list[Hypothesis] = []
         for look, where in self._looks(near):
-            if look == "more" and many and detail is None and not twinned:
+            if look == "more" and many and detail is None:
                 detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
             # Once places that are alike are known, or what fits in detail, only a finer grid may tell them apart.
             if (twinned or detail is not None) and look in ("more", "other"):
@@ -112,6 +112,8 @@ class Finder:
                 if fits:
                     most = min(most, int(times * expert().detail.around_points))
                 level = self._around(search, known, own, most)
+                # Where what surrounds them has too many points for a finer grid, what fits is looked at on this one.
+                level = search.level if level is None and fits else level
             else:
                 level = search.level
             if level is None:

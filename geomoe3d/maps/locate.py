@@ -243,10 +243,13 @@ class Search:
         # What was known before did not convince, or it would not be asked again.
         plain = max([known.plain, *(known.better * score for score, _ in scored)]) if more else known.plain
         found: tuple[float, FloatArray] | None = None  # votes of its window, and where the scan's middle lies
-        motions = ahead(lambda w: self.query.motions(w, known.per_window[more], more=more), windows)
+        thorough = more or self.has_many_places
+        motions = ahead(
+            lambda w: self.query.motions(w, known.per_window[more], more=more, sparing=not thorough), windows
+        )
         for number, window in enumerate(windows):
             if (
-                number >= times * known.first_windows[more or self.has_many_places]
+                number >= times * known.first_windows[thorough]
                 and max((q for q, _ in scored), default=0.0) > plain
             ):
                 break

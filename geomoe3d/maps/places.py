@@ -175,7 +175,13 @@ class Query:
         return len(self._cells.centers)
 
     def motions(
-        self, window: Window, count: int, *, more: bool = False, mutual: bool = False
+        self,
+        window: Window,
+        count: int,
+        *,
+        more: bool = False,
+        mutual: bool = False,
+        sparing: bool = False,
     ) -> list[Hypothesis]:
         """Motions into a window, best first, T_map_scan (4, 4) local coordinates of both.
 
@@ -184,9 +190,10 @@ class Query:
             count: at most so many.
             more: from more matches and seeds: two to four times as long, and more is found.
             mutual: from matches alone that are each other's best: a third of the time, enough for what is alike.
+            sparing: from fewer of the scan's points, enough where the map has few windows.
         """
         known, there = expert().places, self.level.compared.take(window.keys)
-        scan = self._scan if more else self._few
+        scan = self._few if sparing else self._scan
         # A small scan has few points to match, and of their first choices too few are right.
         choices = 1 if mutual else min(known.choices, math.ceil(known.matches[more] / len(scan.points)))
         index, distance, _, both = nearest_features(scan.features, there.features, choices, False)

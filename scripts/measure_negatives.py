@@ -24,7 +24,7 @@ import click
 import numpy as np
 from measure_multiway import dev_rooms, generated_rooms
 
-from geomoe3d.batch.mix import beside_others, share_that_belongs
+from geomoe3d.batch.mix import beside_others, held_down, share_that_belongs
 from geomoe3d.clouds.io import load_points
 from geomoe3d.config import load_config
 from geomoe3d.data.threedmatch import find_data_root
@@ -102,6 +102,7 @@ def _run(path: Path, trials: list[Trial], registrar: Registrar) -> list[dict[str
                 "right": _is_right(result.T_target_source, trial.truth),
                 "status": result.status,
                 "confidence": result.confidence,
+                "held": held_down(result.confidence, result.reasons, result.evidence),
             }
             file.write(json.dumps(line) + "\n")
             file.flush()
@@ -116,7 +117,7 @@ def _is_right(T: FloatArray, truth: FloatArray | None) -> bool:
 
 def _tell(group: str, lines: list[dict[str, Any]]) -> None:
     surely = [line for line in lines if line["confidence"] >= 0.95]
-    share = share_that_belongs(np.array([line["confidence"] for line in lines]))
+    share = share_that_belongs(np.array([line["confidence"] for line in lines if not line.get("held")]))
     added = prior_logit(share)
     still = [line["right"] for line in lines if beside_others(line["confidence"], added) >= 0.95]
     accepted = [line for line in lines if line["status"] == "ok"]

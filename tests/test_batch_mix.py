@@ -12,6 +12,7 @@ from geomoe3d.batch.store import BatchStore
 from geomoe3d.cli.batch import table
 from geomoe3d.config import expert, load_config
 from geomoe3d.data.sample import make_sample_pair
+from geomoe3d.decision.scale import UNITS_DIFFER
 from geomoe3d.runtime.words import of_all
 
 
@@ -63,6 +64,29 @@ def test_an_ok_that_falls_below_the_limit_says_why_and_keeps_what_it_was() -> No
     assert "(0.970 by itself), below 0.95" in near["reasons"][0]
     assert sure["status"] == "ok" and 0.95 < sure["confidence"] < 0.9999 and sure["reasons"] == ["a note"]
     assert records[1]["result"]["status"] == "ok"  # the journal's own stays as it is
+
+
+def test_what_a_rule_held_down_says_nothing_of_the_mix() -> None:
+    """Corridors, copies of rooms and clouds in other units belong together for all that is known of them."""
+    together = [record(str(k), 0.97) for k in range(4)]
+    limits = expert().confidence
+    slid = [record(f"slid {k}", limits.most_sliding, "ambiguous") for k in range(60)]
+    like = [record(f"like {k}", limits.most_doubted, "ambiguous") for k in range(60)]
+    twice = [record(f"twice {k}", 0.23, "ambiguous") for k in range(60)]  # of two answers that were held down
+    feet = [record(f"feet {k}", 0.0, "failed") for k in range(60)]
+    for line in twice:
+        line["result"]["evidence"] |= {"confidence_first": limits.most_sliding, "confidence_second": 0.2}
+    for line in feet:
+        line["result"] |= {"reasons": [f"{UNITS_DIFFER}: lengths in 'a' are 3.281 times"], "evidence": {}}
+    for held in (slid, like, twice, feet):
+        found, share = shared_out([*together, *held], load_config(None, []))
+        assert share is None and found["0"]["result"]["status"] == "ok"
+    # Beside pairs that do not belong together they are less sure, too.
+    strangers = [record(f"no {k}", 0.02, "low_confidence") for k in range(60)]
+    found, share = shared_out([*together, *slid, *strangers], load_config(None, []))
+    alone, _ = shared_out([*together, *strangers], load_config(None, []))
+    assert share is not None and found["0"] == alone["0"] and found["0"]["result"]["status"] != "ok"
+    assert found["slid 0"]["result"]["confidence"] < limits.most_sliding
 
 
 def test_nothing_changes_where_pairs_belong_together_or_a_prior_is_given() -> None:

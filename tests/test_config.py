@@ -74,10 +74,13 @@ def test_a_misspelt_key_names_the_right_one(key: str) -> None:
 def test_a_key_without_its_section_is_found() -> None:
     with pytest.raises(ConfigError, match=r"did you mean 'estimator.inlier_threshold'"):
         load_config(None, ["inlier_threshold=1"])
-    with pytest.raises(
-        ConfigError, match=r"known keys: voxel_size, seed, [^;]*decision.prior; `geomoe3d config"
-    ):
-        load_config(None, ["qqqq=1"])
+    with pytest.raises(ConfigError, match=r"unknown key 'desicion.prior'; did you mean 'decision.prior'"):
+        load_config(None, ["desicion.prior=0.5"])
+    for unlike in ("qqqq", "qqqq.wwww"):
+        with pytest.raises(ConfigError, match=f"unknown key '{unlike}'; known here: ") as told:
+            load_config(None, [f"{unlike}=1"])
+        said = str(told.value)
+        assert "decision" in said and "`geomoe3d config --all` lists all keys" in said and len(said) < 250
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,14 @@ def test_index_and_locate_in_the_shell(rooms, scan, tmp_path, monkeypatch, capfd
     grid = ("--voxel-size", GRID)
     assert ask("index", "other.npy", "house.map", *grid) == ExitCode.OK
     assert ask("index", "other.npy", "first.npy", "house.map", *grid) == ExitCode.OK
-    assert "2 clouds (1 new)" in capfd.readouterr().out
+    said = capfd.readouterr()
+    assert "2 clouds (1 new)" in said.out
+    assert (
+        said.err.count(
+            "in one coordinate system and one unit; scans in coordinates of their own need --poses"
+        )
+        == 1
+    )
     assert ask("locate", "scan.npy", "house.map", *grid, "--json", "--output", "poses.tum") == ExitCode.OK
     told = json.loads(capfd.readouterr().out)
     assert told["status"] == "ok"
@@ -138,6 +145,14 @@ def test_poses_are_never_written_over_a_map_or_a_scan(tmp_path, monkeypatch, cap
         assert ask(*locate, output) == ExitCode.BAD_INPUT
         assert said in capfd.readouterr().err
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_folder_in_the_place_of_a_map_is_told_to_be_indexed(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    Path("my scans").mkdir()
+    np.save("scan.npy", np.zeros((5, 3)))
+    assert ask("locate", "scan.npy", "my scans") == ExitCode.BAD_INPUT
+    assert "geomoe3d index 'my scans' NAME.map" in capfd.readouterr().err
 
 
 def test_an_empty_folder_is_named(tmp_path, monkeypatch, capfd):

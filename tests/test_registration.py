@@ -337,6 +337,12 @@ def test_one_file_given_twice_is_mentioned(pair, tmp_path):
     same = geomoe3d.register(tmp_path / "a.npy", str(tmp_path / "a.npy"))
     assert "source and target are the same file" in same.reasons
     np.save(tmp_path / "b.npy", pair[0])
+    again = geomoe3d.register(tmp_path / "a.npy", tmp_path / "b.npy")
+    told = (
+        f"'{tmp_path / 'a.npy'}' is '{tmp_path / 'b.npy'}' once more: the files are the same, byte for byte"
+    )
+    assert again.status == "ok" and again.reasons == (told,)
+    np.save(tmp_path / "b.npy", np.nextafter(pair[0], np.inf))  # as long, and another one
     assert geomoe3d.register(tmp_path / "a.npy", tmp_path / "b.npy").reasons == ()
 
 

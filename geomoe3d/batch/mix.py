@@ -7,7 +7,7 @@ made less sure here, never surer.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from geomoe3d.config import RegistrationConfig, expert
 from geomoe3d.decision.confidence import prior_logit, said_below
 from geomoe3d.decision.repeat import logit
+from geomoe3d.decision.scale import UNITS_DIFFER
 from geomoe3d.runtime.words import of_all
 from geomoe3d.types import FloatArray
 
@@ -32,7 +33,8 @@ def shared_out(
 
     A confidence p becomes the logistic function of logit(p) + logit(prior) - logit(fitted prior), the prior that of
     `share_that_belongs`. An answer that was ok and falls below ``decision.min_confidence`` is low_confidence, and
-    gives that as its first reason.
+    gives that as its first reason. What a rule held down, as of a pair that slides along itself or whose units differ,
+    does not count: it says nothing of whether the pair belongs together.
 
     Args:
         records: as the journal keeps them; left as they are.
@@ -40,8 +42,13 @@ def shared_out(
     """
     records = list(records)
     unchanged = {record["id"]: record for record in records}
-    found = [record["result"] for record in records if record["result"] is not None]
-    if config.decision.prior is not None or len(found) < 2:
+    results = [record["result"] for record in records if record["result"] is not None]
+    found = [
+        result
+        for result in results
+        if not held_down(result["confidence"], result["reasons"], result["evidence"])
+    ]
+    if config.decision.prior is not None or len(results) < 2 or not found:
         return unchanged, None
     alone = np.array([result["confidence"] for result in found])
     added = prior_logit(share_that_belongs(alone))
@@ -73,6 +80,18 @@ def share_that_belongs(confidences: FloatArray) -> float:
 def beside_others(alone: float, added: float) -> float:
     """A confidence where the prior adds so much to its logit (`prior_logit`), never above what it was alone."""
     return min(alone, float(1 / (1 + np.exp(-logit(alone) - added))))
+
+
+def held_down(confidence: float, reasons: Sequence[str], evidence: Mapping[str, float]) -> bool:
+    """Whether a rule decided a confidence, or one of the two that it was made of, and not what the clouds show;
+    arguments as in the result."""
+    if any(reason.startswith(UNITS_DIFFER) for reason in reasons):
+        return True
+    limits = expert().confidence
+    most = {limits.most_sliding, limits.most_doubted, expert().causes.most_doubted}
+    return not most.isdisjoint(
+        (confidence, evidence.get("confidence_first"), evidence.get("confidence_second"))
+    )
 
 
 def _less_sure(record: Record, added: float, share: float, least: float) -> Record:

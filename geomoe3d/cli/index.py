@@ -115,6 +115,12 @@ def command(
             "begin anew with --fresh if that was the same scan",
             err=True,
         )
+    if where is None and len(made.sources) > max(len(before), 1) and not quiet:
+        click.echo(
+            "note: all clouds are taken as they are, in one coordinate system and one unit; scans in coordinates of "
+            "their own need --poses",
+            err=True,
+        )
     if config.voxel_size is not None and config.voxel_size < made.voxel_sizes[0]:
         click.echo(
             f"note: the map keeps no points closer than {made.voxel_sizes[0]:.4g}, so it is described on that grid, "

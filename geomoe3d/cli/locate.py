@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
@@ -108,6 +110,11 @@ def command(
         if is_map(others[-1]):
             raise click.UsageError(f"'{maps[0]}' and '{others[-1]}' are maps: give one map, behind the scans")
         raise use_instead(f"'{maps[0]}' is a map, and the map comes last, behind the scans", *others, maps[0])
+    if Path(inputs[-1]).is_dir() and not is_map(inputs[-1]):
+        raise click.UsageError(
+            f"the map comes last, and '{inputs[-1]}' is a folder; make a map of its clouds: geomoe3d index "
+            f"{shlex.quote(inputs[-1])} NAME.map"
+        )
     from geomoe3d.cli.progress import stage_display, stdout_to_stderr
 
     with stdout_to_stderr(), stage_display(quiet) as stage:

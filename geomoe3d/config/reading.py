@@ -170,6 +170,10 @@ def _explain(error: ValidationError, section: type[Section]) -> str:
     for problem in error.errors():
         key = ".".join(str(part) for part in problem["loc"])
         if problem["type"] == "extra_forbidden":
+            inner = problem["input"]
+            while key not in MOVED and isinstance(inner, dict) and inner:  # a section: by a key in it
+                name, inner = next(iter(inner.items()))
+                key += f".{name}"
             hint = f"it is now {MOVED[key]}" if key in MOVED else _nearest(key, known_keys(section))
             parts.append(f"unknown key '{key}'; {hint}")
         elif problem["type"] in ("model_type", "model_attributes_type"):
@@ -195,6 +199,6 @@ def _nearest(key: str, keys: list[str]) -> str:
         close = [leaves[m] for m in difflib.get_close_matches(key.rsplit(".", 1)[-1], list(leaves), n=1)]
     if close:
         return f"did you mean '{close[0]}'?"
-    usual = [name for name in keys if not name.startswith("expert.")]
-    more = "" if len(usual) == len(keys) else "; `geomoe3d config --all` lists those of experts too"
-    return f"known keys: {', '.join(usual)}{more}"
+    known = dict.fromkeys(name.split(".")[0] for name in keys)
+    more = "; `geomoe3d config --all` lists all keys" if "expert" in known else ""
+    return f"known here: {', '.join(known)}{more}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from geomoe3d.clouds.viewpoint import may_have_seen
 from geomoe3d.clouds.voxel_size import choose_voxel_size
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.decision.confidence import Judgement
+from geomoe3d.runtime.words import once_more
 from geomoe3d.types import FloatArray, PointCloud, PreparedCloud
 
 _NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 99999.0)  # what programs write for no measurement
@@ -42,8 +44,7 @@ def remarks(
             f"a voxel size of {wanted:.4g} gives more than {config.max_points} voxels; "
             f"{voxel_size:.4g} was used (preparation.max_points sets the limit)"
         )
-    if _is_one_file(given):
-        yield "source and target are the same file"
+    yield from _one_file(given)
     if judgement.status == "ok":
         return
     for cloud in {cloud.name: cloud for cloud in described}.values():
@@ -124,6 +125,17 @@ def flatness(name: str, points: FloatArray) -> str | None:
     return None
 
 
-def _is_one_file(given: tuple[Any, Any]) -> bool:
+def _one_file(given: tuple[Any, Any]) -> Iterator[str]:
+    """A sentence where both are one file, or two of the same content."""
     paths = [Path(data) for data in given if isinstance(data, (str, os.PathLike))]
-    return len(paths) == 2 and paths[0].resolve() == paths[1].resolve()  # asks for no file that may be gone
+    if len(paths) < 2:
+        return
+    if paths[0].resolve() == paths[1].resolve():  # asks for no file that may be gone
+        yield "source and target are the same file"
+        return
+    try:
+        same = filecmp.cmp(paths[0], paths[1], shallow=False)  # reads them where they are equally long
+    except OSError:
+        return
+    if same:
+        yield once_more(str(paths[0]), str(paths[1]))

@@ -133,7 +133,7 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, t
             if told["geomoe3d map"] > VERSION:
                 raise FormatError(
                     f"'{path}' was written by a later version of geomoe3d (map version {told['geomoe3d map']}, known "
-                    f"is {VERSION}); update geomoe3d, or index the map again"
+                    f"is {VERSION}); update geomoe3d, or index it anew with --fresh"
                 )
             arrays = {name: archive[name] for name in archive.files if name != "told"}
             voxels = VoxelSums(float(told["edge"]), *(arrays[name] for name in _VOXELS if name in arrays))
@@ -149,7 +149,8 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, t
             sources = tuple(Source(**source) for source in told["sources"])
             if _hash(arrays) != told["sha256"]:
                 raise FormatError(
-                    f"'{path}' is damaged: its content does not match its hash; index the map again"
+                    f"'{path}' is damaged: its content does not match its hash; make it anew: geomoe3d index --fresh "
+                    f"CLOUDS {path}"
                 )
             return sources, voxels, levels
     except FormatError:
@@ -158,7 +159,8 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Source, ...], VoxelSums, t
         raise MissingFileError(f"there is no map '{path}'; make one: geomoe3d index CLOUD {path}") from None
     except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
         raise FormatError(
-            f"'{path}' is no map of geomoe3d, or it is damaged or cut short; make one: geomoe3d index CLOUD OUT.map"
+            f"'{path}' is no map of geomoe3d, or it is damaged or cut short; make it anew: geomoe3d index "
+            f"--fresh CLOUDS {path}"
         ) from None
     except OSError as error:
         raise cannot_read(error, f"cannot read the map '{path}': {error.strerror or error}") from None

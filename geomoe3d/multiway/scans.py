@@ -18,7 +18,7 @@ from geomoe3d.clouds.transform_files import load_transform
 from geomoe3d.clouds.voxel_size import bounded_voxel_size, choose_voxel_size
 from geomoe3d.config import PreparationConfig, expert
 from geomoe3d.errors import GeoMoE3DError, InputError, MissingFileError
-from geomoe3d.runtime.words import natural_key
+from geomoe3d.runtime.words import natural_key, once_more
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,7 @@ def find_copies(scans: Iterable[Scan], content: Callable[[str], str | None]) -> 
 def copies_in_words(copies: Mapping[str, str]) -> list[str]:
     """A sentence for each copy."""
     return [
-        f"'{name}' is '{first}' once more: the files are the same, byte for byte, and each is taken for a scan of its "
-        "own; leave one out if that was not meant"
+        f"{once_more(name, first)}, and each is taken for a scan of its own; leave one out if that was not meant"
         for name, first in copies.items()
     ]
 

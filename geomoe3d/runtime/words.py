@@ -27,6 +27,11 @@ def shape_in_words(shape: Sequence[int]) -> str:
     return f"a block of {' x '.join(f'{count:,}' for count in shape)} numbers"
 
 
+def once_more(name: str, first: str) -> str:
+    """What is said of a file that has the content of another one."""
+    return f"'{name}' is '{first}' once more: the files are the same, byte for byte"
+
+
 def of_the_score(share: float) -> str:
     """How another transform scores beside the answer, the share of its score given, not below zero."""
     if share >= 1.005:

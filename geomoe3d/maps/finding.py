@@ -93,6 +93,9 @@ class Finder:
         for look, where in self._looks(near):
             if look == "more" and many and detail is None:
                 detail, fitting = self._in_detail(cloud, view, search, own, count, clock)
+                best_fit = [Hypothesis(T) for _, T in fitting[:1]]
+                if twinned and not all(search.differ(h, Hypothesis(T)) for h in best_fit for T in known):
+                    detail, fitting = None, []  # a copy that is known fits best, and which of them is chance
             # Once places that are alike are known, or what fits in detail, only a finer grid may tell them apart.
             if (twinned or detail is not None) and look in ("more", "other"):
                 continue

@@ -13,7 +13,8 @@ from geomoe3d.config import load_config
 from geomoe3d.geometry.se3 import make_transform, motions_apart, shift_frames
 from geomoe3d.maps.detail import FITS_IN_DETAIL, Detail
 from geomoe3d.maps.finding import FITS_BETTER
-from geomoe3d.maps.locate import Found, Search
+from geomoe3d.maps.found import Found
+from geomoe3d.maps.locate import Search
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.types import Hypothesis
 

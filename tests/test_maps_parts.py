@@ -16,6 +16,7 @@ from geomoe3d.features.pyramid import pyramid
 from geomoe3d.geometry.se3 import make_transform, transform_points
 from geomoe3d.maps import finding
 from geomoe3d.maps.facing import both_sides, facing_alike
+from geomoe3d.maps.found import Found
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.locate import Search
 from geomoe3d.maps.places import Query, Window, likest
@@ -153,7 +154,7 @@ def test_what_fits_in_detail_is_looked_at_also_where_no_finer_grid_can_be_made(m
         return []
 
     nothing = SimpleNamespace(answer=None, judgement=SimpleNamespace(confidence=0.0))
-    looked = finding.Found(None, nothing)
+    looked = Found(None, nothing)
     level = SimpleNamespace(voxel_size=0.2, compared=None)
     search = SimpleNamespace(level=level, has_many_places=True, candidates=candidates)
     search.look, search.decide = lambda *_, **__: looked, lambda found: (found[0], [])

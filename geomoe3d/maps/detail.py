@@ -18,7 +18,8 @@ import numpy as np
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import expert
 from geomoe3d.geometry.se3 import inverse, make_transform, transform_points
-from geomoe3d.maps.locate import Found, Search
+from geomoe3d.maps.found import Found
+from geomoe3d.maps.locate import Search
 from geomoe3d.maps.places import Window
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.runtime.threads import each, single_blas_thread

@@ -22,8 +22,9 @@ from geomoe3d.decision.remarks import remarks
 from geomoe3d.errors import EmptyCloudError
 from geomoe3d.geometry.se3 import motions_apart, shift_frames, transform_points
 from geomoe3d.maps.detail import Detail, Fitting
+from geomoe3d.maps.found import Found
 from geomoe3d.maps.level import Level, compared_rows, described
-from geomoe3d.maps.locate import Found, Search, likely
+from geomoe3d.maps.locate import Search, likely
 from geomoe3d.maps.places import Cells, radius_of
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.pipeline import Pipeline

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from geomoe3d.config import expert
-from geomoe3d.maps.locate import Found
+from geomoe3d.maps.found import Found
 from geomoe3d.maps.map import Map
 from geomoe3d.maps.voxels import VoxelSums
 from geomoe3d.pipeline import Pipeline

@@ -11,21 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from geomoe3d.clouds.pair import Pair
 from geomoe3d.clouds.range_image import RangeImage
 from geomoe3d.config import RegistrationConfig, expert
-from geomoe3d.decision.accuracy import measure_accuracy
-from geomoe3d.decision.answer import Decision
 from geomoe3d.decision.confidence import Judgement, judge, lead_over
-from geomoe3d.decision.scale import Scale, measure_scale
 from geomoe3d.decision.selection import Selection, surfaces_of
-from geomoe3d.decision.shared_surface import SharedSurface
 from geomoe3d.geometry.se3 import inverse, make_transform, motions_apart, transform_points
+from geomoe3d.maps.found import Found
 from geomoe3d.maps.level import Compared, Level
 from geomoe3d.maps.places import Cells, Query, Window, likest
 from geomoe3d.maps.sight import Sight, seen_factor
@@ -33,51 +29,11 @@ from geomoe3d.maps.stranger import shown
 from geomoe3d.pipeline import Pipeline
 from geomoe3d.runtime.threads import ahead, beside, each, single_blas_thread
 from geomoe3d.runtime.timing import StageClock
-from geomoe3d.types import Accuracy, FloatArray, Hypothesis, PreparedCloud
+from geomoe3d.types import FloatArray, Hypothesis, PreparedCloud
 
 ANOTHER_STANDS = (
     "at another place the scan would be ok too, were it not for this one: rooms may be copies of each other"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What was decided at one place.
-
-    Attributes:
-        pair: the scan, and the map around the place.
-        decision: of the ordinary line there.
-        sure: whether it was ok beside all rivals, before the scale was measured: more looks cannot help then.
-        stood: whether it was ok before it had rivals elsewhere.
-        measures: the scale and the accuracy of its answer, where somebody measured them.
-    """
-
-    pair: Pair
-    decision: Decision
-    sure: bool = False
-    stood: bool = False
-    measures: tuple[Scale | None, Accuracy | None] | None = None
-
-    @property
-    def score(self) -> float:
-        """Of the answer; none is worth nothing."""
-        return 0.0 if self.decision.answer is None else self.decision.answer.score
-
-    @property
-    def confidence(self) -> float:
-        """Of the decision."""
-        return self.decision.judgement.confidence
-
-    def measured(self) -> Found:
-        """The same with its measures."""
-        if self.measures is not None or self.decision.answer is None:
-            return self
-        T, shared = self.decision.T_target_source, SharedSurface(*self.pair.clouds)
-        measures = beside(
-            lambda: measure_scale(T, shared),
-            lambda: measure_accuracy(T, shared, self.pair.matched, self.pair.inlier_threshold),
-        )
-        return replace(self, measures=measures)
 
 
 class Search:

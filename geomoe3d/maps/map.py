@@ -24,8 +24,8 @@ from geomoe3d.decision.similarity import scaled_cloud
 from geomoe3d.errors import EmptyCloudError, InputError
 from geomoe3d.geometry.se3 import check_motion, shift_frames, transform_points
 from geomoe3d.maps.finding import Finder
+from geomoe3d.maps.found import Found
 from geomoe3d.maps.level import Level
-from geomoe3d.maps.locate import Found
 from geomoe3d.maps.location import Location, Place, nowhere
 from geomoe3d.maps.pieces import pieces
 from geomoe3d.maps.store import Source, load, save
